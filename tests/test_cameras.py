@@ -1,8 +1,11 @@
 """A moving camera's poses come in from every tool's own layout, and wrong ones are refused."""
 
 import dataclasses
+import json
+import struct
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import joblib
 import little_room
@@ -18,6 +21,7 @@ from mover.io.capture.camera_file import path_of, path_to_arrays
 from mover.io.capture.folder import read_capture, write_capture
 from mover.io.capture.merge import import_into
 from mover.io.capture.parts import Parts
+from mover.io.files.cameras import read_camera_file
 from mover.io.files.fields import At
 from mover.io.formats import chosen, names
 from mover.io.people.paths import read_colmap, read_slam, read_tum
@@ -62,6 +66,15 @@ def write_megasam(folder: Path) -> Path:
     return file
 
 
+def write_vggt(folder: Path) -> Path:
+    """facebookresearch/vggt, demo_gradio.py: np.savez of the predictions, x_cam = [R | t] x."""
+    extrinsic = np.linalg.inv(true_path())[:, :3].astype(np.float32)
+    intrinsic = np.tile(lens(0.8), (COUNT, 1, 1)).astype(np.float32)
+    depth = np.ones((COUNT, 18, 32, 1), np.float32)
+    np.savez(folder / "predictions.npz", extrinsic=extrinsic, intrinsic=intrinsic, depth=depth)
+    return folder
+
+
 def seven() -> np.ndarray:
     """DPVO's terminate(): x y z, quaternion x y z w, camera to world."""
     T = true_path()
@@ -104,8 +117,8 @@ def write_colmap(folder: Path) -> Path:
 
 
 WRITERS: dict[str, Callable[[Path], Path]] = {
-    "vipe": write_vipe, "megasam": write_megasam, "wham": write_wham, "gvhmr": write_gvhmr,
-    "tum": write_tum, "colmap": write_colmap,
+    "vipe": write_vipe, "megasam": write_megasam, "vggt": write_vggt, "wham": write_wham,
+    "gvhmr": write_gvhmr, "tum": write_tum, "colmap": write_colmap,
 }  # fmt: skip
 
 
@@ -165,6 +178,13 @@ def test_whams_sign_for_no_slam_is_refused(tmp_path: Path) -> None:
     joblib.dump(row, tmp_path / "slam_results.pth")
     with pytest.raises(InputError, match="camera that was followed"):
         read_slam(tmp_path)
+
+
+def test_colmaps_binary_poses_are_named_with_their_cure(tmp_path: Path) -> None:
+    (tmp_path / "images.bin").write_bytes(bytes(8))
+    for path in (tmp_path, tmp_path / "images.bin"):
+        with pytest.raises(InputError, match=r"^images\.bin: .*model_converter --output_type TXT"):
+            read_colmap(path)
 
 
 @pytest.mark.parametrize(
@@ -257,3 +277,99 @@ def test_another_lens_is_said(capture: Capture) -> None:
     at = {"frame": np.arange(COUNT), "T_world_camera": true_path(), "focal": np.full(COUNT, 0.9)}
     path_of(At(at, "cameras.npz"), capture.scene.camera, None, said.append)
     assert "focal length is 0.9 widths" in said[0]
+
+
+# Lenses, as calibrations give them: the same one in every form.
+
+LENS = (740.5, 741.0, 479.5, 269.5)
+FX, FY, CX, CY = LENS
+K = [[FX, 0, CX], [0, FY, CY], [0, 0, 1]]
+NINE = " ".join(str(v) for row in K for v in row)
+YAML = f"""%YAML:1.0
+---
+image_width: 960
+image_height: 540
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ {FX}, 0., {CX}, 0., {FY},
+       {CY}, 0., 0., 1. ]
+distortion_coefficients: !!opencv-matrix
+   rows: 1
+   cols: 5
+   dt: d
+   data: [ 1e-04, 0., 0., 0., 0. ]
+"""
+ROS = f"""image_width: 960
+image_height: 540
+camera_name: head
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [{NINE.replace(" ", ", ")}]
+distortion_model: plumb_bob
+"""
+XML = f"""<?xml version="1.0"?><opencv_storage><image_Width>960</image_Width>
+<image_Height>540</image_Height><Camera_Matrix type_id="opencv-matrix"><rows>3</rows><cols>3</cols>
+<dt>d</dt><data>{NINE}</data></Camera_Matrix></opencv_storage>"""
+SIDES = {"width": 960, "height": 540}
+REALSENSE = {**SIDES, "fx": FX, "fy": FY, "ppx": CX, "ppy": CY, "coeffs": [0.0] * 5}
+DEPTH = {**SIDES, "fx": 380.0, "fy": 380.0, "ppx": 480.0, "ppy": 270.0}
+COLMAP = f"# Camera list\n1 PINHOLE 960 540 {FX} {FY} {CX + 0.5} {CY + 0.5}\n"
+BINARY = struct.pack("<QiiQQ4d", 1, 1, 1, 960, 540, FX, FY, CX + 0.5, CY + 0.5)
+LENSES: dict[str, tuple[str, str | bytes | dict[str, Any]]] = {
+    "OpenCV's YAML": ("calib.yml", YAML), "ROS": ("head.yaml", ROS), "OpenCV's XML": ("c.xml", XML),
+    "OpenCV's JSON": ("c.json", {**SIDES, "camera_matrix": {"data": np.ravel(K).tolist()}}),
+    "a dump": ("d.json", {**SIDES, "mtx": K, "dist": [[0, 0, 0, 0, 0]]}),
+    "RealSense": ("rs.json", REALSENSE),
+    "RealSense, all": ("all.json", {"serial": "1", "depth": DEPTH, "color": REALSENSE}),
+    "Open3D": ("o.json", {**SIDES, "intrinsic_matrix": np.array(K).T.ravel().tolist()}),
+    "COLMAP": ("cameras.txt", COLMAP), "COLMAP, binary": ("cameras.bin", BINARY),
+}  # fmt: skip
+
+
+def written(folder: Path, name: str, content: str | bytes | dict[str, Any]) -> Path:
+    if isinstance(content, dict):
+        content = json.dumps(content)
+    (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    return folder / name
+
+
+@pytest.mark.parametrize("kind", LENSES)
+def test_every_calibration_gives_the_same_lens(kind: str, tmp_path: Path) -> None:
+    """Those that count pixels from the centre of the first one are moved by half of one."""
+    path = written(tmp_path, *LENSES[kind])
+    found = read_camera_file(path, None).value
+    wanted = {"w": 960, "h": 540, "fl_x": FX, "fl_y": FY, "cx": CX + 0.5, "cy": CY + 0.5}
+    assert {name: found[name] for name in wanted} == wanted
+    if kind.startswith("COLMAP"):
+        assert read_camera_file(tmp_path, None).value == found
+
+
+POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n"
+NO_LENSES: dict[str, tuple[str, str | bytes | dict[str, Any], str]] = {
+    "bent": ("c.yml", YAML.replace("1e-04", "-0.3"), "corners by .* undistort the images"),
+    "a fisheye": ("cameras.txt", COLMAP.replace("PINHOLE", "OPENCV_FISHEYE") + " ", "expected 8"),
+    "several": ("cameras.txt", COLMAP + COLMAP.replace("740.5", "800"), "2 cameras, expected one"),
+    "cut off": ("cameras.bin", BINARY[:50], "cannot be read .it is damaged, cut off"),
+    "no size": ("d.json", {"mtx": K}, "no width and height, expected .* give --image"),
+    "another matrix": ("d.json", {**SIDES, "K": [[1, 2], [3, 4]]}, "'K' has .*3 x 3 numbers"),
+    "other words": ("d.json", {"hello": 1}, "one of the fields fl_x, fx, camera_mtx"),
+    "text": ("cam_K.txt", "fx fy\n100 abc\n", r"'fx fy 100 abc'.*expected 3 x 3 numbers"),
+    "no numbers": ("c.yml", "hello: world\n", "no numbers with names"),
+    **{f"a pointer, {end}": (f"c.{end}", POINTER, "pointer of Git LFS.*git lfs pull")
+       for end in ("txt", "yml", "xml", "json")},
+    "a web page": ("c.json", " <!DOCTYPE html><html>", "web page in place of the file"),
+    "nothing": ("c.json", "", "it is empty: copy or download it again"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", NO_LENSES)
+def test_what_is_no_lens_is_named_in_the_users_words(kind: str, tmp_path: Path) -> None:
+    name, content, words = NO_LENSES[kind]
+    with pytest.raises(InputError, match=words) as caught:
+        read_camera_file(written(tmp_path, name, content), None)
+    assert str(caught.value).startswith(name)
+    assert "Error" not in str(caught.value)
+    assert "could not convert" not in str(caught.value)

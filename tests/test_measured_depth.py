@@ -1,5 +1,6 @@
 """Measured depth: files, its scale against the room, and what it does in a run."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +19,12 @@ from mover.geometry.placement import place_in
 from mover.geometry.raster import Crops, Topology, look
 from mover.io.capture.folder import folder_parts, read_capture, write_capture
 from mover.io.capture.merge import import_into
-from mover.io.files.images import find_depth_file, read_depth_image
+from mover.io.files.images import (
+    find_depth_file,
+    read_depth,
+    read_depth_image,
+    reference_frame,
+)
 from mover.stages.config import PlaceConfig
 from mover.stages.objects.gather_depth import DepthImageInputs, gather_depth
 from mover.stages.objects.place_inputs import coarser_image
@@ -145,6 +151,46 @@ def test_inverse_depth_may_be_an_array_or_a_grey_picture(tmp_path: Path, small_r
         found = read_depth_image(folder / name, camera, metric=False)
         assert torch.equal(found.values, torch.from_numpy(values).float())
     assert find_depth_file(tmp_path) == (folder / "000000.png", False)
+
+
+WHOLE_VIDEOS = {  # of MegaSaM, which halves the sides, and of VGGT, whose sides are 14 n pixels
+    "depths": ("float16", lambda w, h: (h // 2, w // 2), ()),
+    "depth": ("float32", lambda w, h: (round(h / 14) * 14, round(w / 14) * 14), (1,)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("key", WHOLE_VIDEOS)
+def test_depths_of_a_whole_video_give_the_frame_of_the_reference_picture(
+    key: str, tmp_path: Path, small_room, caplog
+):
+    camera = small_room.capture.scene.camera
+    dtype, shape, tail = WHOLE_VIDEOS[key]
+    size = shape(camera.width, camera.height)
+    values = np.arange(1, 5)[:, None, None] * np.ones((4, *size))
+    write_capture(small_room.capture, tmp_path / "room")
+    (tmp_path / "room" / "depth").mkdir()
+    file = tmp_path / "room" / "depth" / "000000.npz"
+    np.savez(file, **{key: values.reshape(4, *size, *tail).astype(dtype)})
+    assert bool((read_capture(tmp_path / "room").depth.values == 1).all())
+    assert "depth maps of 4 frames: that of frame 0 is used" in caplog.text
+    poses = {"frame": np.arange(4), "T_world_camera": np.tile(np.eye(4), (4, 1, 1))}
+    np.savez(tmp_path / "room" / "cameras.npz", **poses, reference=np.array(2))
+    assert bool((read_depth(file, camera, frame=reference_frame(tmp_path / "room")) == 3).all())
+    with pytest.raises(InputError, match="has 4 frames, expected a depth map of frame 7"):
+        read_depth(file, camera, frame=7)
+    for number in (1, 2, 3):
+        np.save(tmp_path / "room" / "depth" / f"{number:06d}.npy", values[number])
+    assert find_depth_file(tmp_path / "room") == (file.with_name("000002.npy"), True)
+
+
+@pytest.mark.parametrize("kind", ["npy", "png", "npz"])
+@pytest.mark.parametrize("folder", ["depth", "disparity"])
+def test_a_pipe_as_depth_is_refused_at_once(kind: str, folder: str, tmp_path: Path, small_room):
+    (tmp_path / folder).mkdir()
+    os.mkfifo(tmp_path / folder / f"000000.{kind}")
+    file, metric = find_depth_file(tmp_path)
+    with pytest.raises(InputError, match=rf"000000\.{kind}: .*no such"):
+        read_depth(file, small_room.capture.scene.camera, metric=metric)
 
 
 def test_what_is_wrong_with_measured_depth_is_one_sentence(tmp_path: Path, small_room):

@@ -1,15 +1,22 @@
 """Which numbers are one person: of bodies and masks by position, of pieces, of two files."""
 
+import functools
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+from mover.core.errors import InputError
 from mover.core.types import Bodies, Camera, Masks, People
 from mover.geometry.camera import project
 from mover.geometry.rle import encode
-from mover.io.capture.tracks import pair_tracks, paired
+from mover.io.capture.bodies_file import bodies_of, bodies_to_arrays
+from mover.io.capture.merge import _added
+from mover.io.capture.parts import Parts
+from mover.io.capture.tracks import join_pieces, pair_tracks, paired
+from mover.io.files.fields import At
 
 CAMERA = Camera(
     torch.tensor([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]]),
@@ -21,7 +28,7 @@ FACES = torch.tensor([[0, 1, 2]])
 FRAMES = range(12)
 
 
-def bodies_of(rows: list[tuple[int, int, tuple[float, float, float]]]) -> Bodies:
+def bodies_of_rows(rows: list[tuple[int, int, tuple[float, float, float]]]) -> Bodies:
     """Boxes of a person's size, each a frame, a track and a position."""
     verts = torch.stack([CORNERS + torch.tensor(place) for _, _, place in rows])
     frame, person = (torch.tensor([row[k] for row in rows]) for k in (0, 1))
@@ -59,7 +66,7 @@ CASES = {  # numbers of bodies and masks: what the bodies' numbers and the masks
 @pytest.mark.parametrize("case", CASES)
 def test_tracks_of_two_tools_are_paired_by_position(case: str, shown: float):
     ours, theirs, of_bodies, of_masks = CASES[case]
-    bodies, people = bodies_of(walkers(*ours)), masks_of(walkers(*theirs), shown)
+    bodies, people = bodies_of_rows(walkers(*ours)), masks_of(walkers(*theirs), shown)
     pairs = pair_tracks(bodies, people, CAMERA)
     assert (pairs.bodies, pairs.masks) == (of_bodies, of_masks)
     assert len(pairs.notes) == bool(of_masks)
@@ -72,9 +79,9 @@ def test_tracks_of_two_tools_are_paired_by_position(case: str, shown: float):
 def test_pieces_are_one_person_where_the_other_side_is_whole():
     rows = walkers(0, 1)
     cut = [(f, 9 if p == 0 and f > 5 else p, place) for f, p, place in rows]
-    pairs = pair_tracks(bodies_of(cut), masks_of(rows), CAMERA)
+    pairs = pair_tracks(bodies_of_rows(cut), masks_of(rows), CAMERA)
     assert (pairs.bodies, pairs.masks) == ({9: 0}, {})
-    pairs = pair_tracks(bodies_of(rows), masks_of(cut), CAMERA)
+    pairs = pair_tracks(bodies_of_rows(rows), masks_of(cut), CAMERA)
     assert (pairs.bodies, pairs.masks) == ({}, {9: 0})
 
 
@@ -82,13 +89,115 @@ def test_what_is_uncertain_keeps_its_number():
     """Two people close together under other numbers; and a mask elsewhere whose number is used."""
     near = [(f, p, (0.05 * p, 0.0, 3.5)) for f in FRAMES for p in (0, 1)]
     others = [(f, p + 5, place) for f, p, place in near]
-    assert pair_tracks(bodies_of(near), masks_of(others), CAMERA).notes == ()
+    assert pair_tracks(bodies_of_rows(near), masks_of(others), CAMERA).notes == ()
     elsewhere = [(f, 0, (-1.2, 0.0, 5.0)) for f in FRAMES] + [
         (f, 4, (1.0, 0.0, 4.0)) for f in FRAMES
     ]
     alone = [(f, 0, (1.0, 0.0, 4.0)) for f in FRAMES]
-    pairs = pair_tracks(bodies_of(alone), masks_of(elsewhere), CAMERA)
+    pairs = pair_tracks(bodies_of_rows(alone), masks_of(elsewhere), CAMERA)
     assert (pairs.bodies, pairs.masks) == ({}, {4: 0, 0: 5})
-    apart = replace(bodies_of(alone), frame=torch.arange(100, 100 + len(FRAMES)))
+    apart = replace(bodies_of_rows(alone), frame=torch.arange(100, 100 + len(FRAMES)))
     assert pair_tracks(apart, masks_of(elsewhere), CAMERA).notes == ()
     assert np.isfinite(apart.verts.numpy()).all()
+
+
+# Pieces of one track.
+
+
+def walk(
+    spans: dict[int, range], step: float = 0.02
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """One who walks to the right, as the tracks of these frames."""
+    rows = [(f, track) for track, span in spans.items() for f in span]
+    place = torch.tensor([[-1 + step * f, 0.1, 5.0 - step * f] for f, _ in rows])
+    return torch.tensor([f for f, _ in rows]), torch.tensor([t for _, t in rows]), place
+
+
+WHAM = {0: range(9), 4: range(11, 20), 17: range(23, 30), 31: range(32, 40)}
+
+
+def with_other(rows: tuple[torch.Tensor, ...], spans: dict[int, range], x: float):
+    """Another, who stands."""
+    more = [(f, track) for track, span in spans.items() for f in span]
+    place = torch.tensor([[x, 0.1, 5.0]]).expand(len(more), 3)
+    frame, person = (torch.tensor([row[k] for row in more]) for k in (0, 1))
+    return tuple(torch.cat(pair) for pair in zip(rows, (frame, person, place), strict=True))
+
+
+def test_pieces_of_a_walker_become_one_and_it_is_said():
+    rows = with_other(walk(WHAM), {2: range(5, 35)}, 2.0)
+    assert join_pieces(*rows) == (
+        {4: 0, 17: 0, 31: 0},
+        ["tracks 0, 4, 17, 31 follow one another in time and position: one person, 0"],
+    )
+
+
+APART = {
+    "a long gap": (walk({0: range(9), 4: range(60, 70)}), None, "0 and 4 .frames 8 and 60."),
+    "elsewhere": (with_other(walk({0: range(9)}), {4: range(11, 20)}, 0.0), None, "0 and 4"),
+    "far away": (with_other(walk({0: range(9)}), {4: range(11, 20)}, 3.0), None, None),
+    "two that could": (
+        with_other(walk({0: range(9), 4: range(11, 20)}), {5: range(12, 20)}, -0.75),
+        None, "0 and 4"),
+    "other shapes": (walk({0: range(9), 4: range(11, 20)}), {4: 3.0}, "0 and 4"),
+    "at one time": (walk({0: range(9), 4: range(20)}), None, None),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", APART)
+def test_what_may_be_another_person_is_named_and_not_joined(case: str):
+    (frame, person, place), shapes, words = APART[case]
+    betas = torch.zeros(len(frame), 10)
+    for track, size in (shapes or {}).items():
+        betas[person == track, 0] = size
+    numbers, notes = join_pieces(frame, person, place, betas)
+    assert numbers == {}
+    assert len(notes) == bool(words)
+    assert not words or re.search(rf"{words}.* may be one person; --tracks 4=0", notes[0])
+
+
+# A second file of bodies.
+
+
+def merged(*files: Bodies) -> tuple[Bodies, list[str]]:
+    parts = [Parts("", bodies=At(bodies_to_arrays(one), f"{k}.npz")) for k, one in enumerate(files)]
+    whole = functools.reduce(_added, parts)
+    assert whole.bodies is not None
+    return bodies_of(whole.bodies, lambda _: None), list(whole.notes)
+
+
+def standing(x: float, track: int = 0, frames: range = FRAMES, z: float = 4.0) -> Bodies:
+    return bodies_of_rows([(f, track, (x, 0.0, z)) for f in frames])
+
+
+SECOND = {  # tracks by where people stand, after a person at -1 with track 0; what is said
+    "another with its number": ([standing(1)], {-1: 0, 1: 1}, "adds track 1"),
+    "another with a free number": ([standing(1, 5)], {-1: 0, 1: 5}, "adds track 5"),
+    "the same again": ([standing(-0.9)], {-0.9: 0}, "replaces track 0"),
+    "the same by another tool": ([standing(-0.9, 8)], {-0.9: 0}, "its person 8 is person 0"),
+    "the very same": ([standing(-1)], {-1: 0}, None),
+    "the next frames": ([standing(-1, 0, range(12, 20))], {-1: 0}, "adds track 0"),
+    "another in later frames": ([standing(1, 0, range(12, 20))], {-1: 0, 1: 1}, "adds track 1"),
+    "two more": ([standing(1), standing(0.2)], {-1: 0, 1: 1, 0.2: 2}, "adds track 2"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", SECOND)
+def test_a_second_file_adds_people_and_says_so(case: str):
+    files, tracks, words = SECOND[case]
+    found, notes = merged(standing(-1), *files)
+    middle = found.verts.mean(1)[:, 0]
+    for x, track in tracks.items():
+        assert found.person[(middle - x).abs() < 0.01].unique().tolist() == [track]
+    assert len(found.person.unique()) == len(set(tracks.values()))
+    pairs = list(zip(found.frame.tolist(), found.person.tolist(), strict=True))
+    assert pairs == sorted(set(pairs))
+    assert words in "\n".join(notes) if words else not notes
+
+
+def test_bodies_of_two_topologies_are_not_mixed():
+    other = replace(standing(1), faces=torch.tensor([[0, 2, 1]]))
+    with pytest.raises(InputError, match=r"1\.npz: has bodies of 8 vertices.*one topology"):
+        merged(standing(-1), other)
+    found, _ = merged(standing(-1), replace(standing(-1), faces=other.faces))
+    assert torch.equal(found.faces, other.faces)

@@ -124,7 +124,7 @@ def angles_of(model: SkinnedBody, pose: BodyPose) -> Float[Tensor, "bodies joint
             value = pose.global_orient.new_zeros(bodies, width)
         if value.shape[-1] != width:
             found = f"has {value.shape[-1]} columns, the model '{model.name}' expects {width}"
-            raise InputError(f"bodies.npz: '{name}' {found}")
+            raise InputError(f"'{name}' {found}")
         rows.append(value.to(pose.global_orient))
     return torch.cat(rows, -1).reshape(bodies, -1, 3)
 
@@ -138,10 +138,13 @@ def shaped(
         InputError: If there are more than the model knows.
     """
     count, most = betas.shape[-1], model.shape_dirs.shape[-1]
-    if count > most:
-        found = f"has {count} columns, the model '{model.name}' knows {most}"
-        raise InputError(f"bodies.npz: 'betas' {found}")
+    if count > most and (betas[..., most:] != 0).any():
+        raise InputError(
+            f"'betas' has {count} columns, the model '{model.name}' knows {most}; expected a file "
+            "of the model that knows as many (SMPL-H of 16, SMPL-X 1.1)"
+        )
     dirs, joint_dirs = model.shape_dirs[..., :count], model.joint_dirs[..., :count]
+    betas = betas[..., :most]
     verts = torch.einsum("vik,bk->bvi", dirs.to(betas), betas)
     joints = torch.einsum("jik,bk->bji", joint_dirs.to(betas), betas)
     return model.verts.to(betas) + verts, model.joints.to(betas) + joints

@@ -105,7 +105,7 @@ class SmplBody:
             count, most = face.shape[-1], self.expression_dirs.shape[-1]
             if count > most:
                 found = f"has {count} columns, the model '{self.name}' knows {most}"
-                raise InputError(f"bodies.npz: 'expression' {found}")
+                raise InputError(f"'expression' {found}")
             dirs = self.expression_dirs[..., :count].to(verts)
             verts = verts + torch.einsum("vik,bk->bvi", dirs, face.to(verts))
             dirs = self.expression_joint_dirs[..., :count].to(verts)
@@ -141,7 +141,7 @@ def with_full_hands(model: SmplBody, pose: BodyPose) -> BodyPose:
             components = model.hands.components[side].to(body)
             if angles.shape[-1] > len(components):
                 most = f"the model '{model.name}' knows {len(components)} or 45 angles"
-                raise InputError(f"bodies.npz: '{name}' has {angles.shape[-1]} columns, {most}")
+                raise InputError(f"'{name}' has {angles.shape[-1]} columns, {most}")
             angles = angles.to(body) @ components[: angles.shape[-1]]
         full[name] = angles.to(body) + added * model.hands.mean[side].to(body)
     return dataclasses.replace(pose, body_pose=body, extra={**pose.extra, **full})

@@ -2,6 +2,7 @@
 
 import glob
 import os
+import re
 import shutil
 import tempfile
 import time
@@ -10,6 +11,12 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 LEFT = 3600  # [s], no file is written for so long
+INSTEAD = {
+    rb"version https://git-lfs": "it is a pointer of Git LFS, not the file: run `git lfs pull`",
+    rb"\s*<(!doctype )?html": "it is a web page in place of the file: download the file itself",
+    rb"\Z": "it is empty: copy or download it again",
+}
+"""What a file may be instead of what was expected, by its first bytes."""
 
 
 @contextmanager
@@ -39,3 +46,21 @@ def copy_whole(source: Path, target: Path) -> None:
         return
     with replacing(target) as part:
         shutil.copyfile(source, part)
+
+
+def reason(error: Exception, path: Path | None = None) -> str:
+    """Why a file cannot be read, in one short line without Python's own words."""
+    if path is not None and path.is_file():
+        with suppress(OSError), path.open("rb") as file:
+            head = file.read(64)
+            for start, words in INSTEAD.items():
+                if re.match(start, head, re.IGNORECASE):
+                    return words
+    if isinstance(error, UnicodeError):
+        return "it is no text in UTF-8"
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    spoken = isinstance(error, ValueError | RuntimeError | SyntaxError | OSError) or path is None
+    if spoken and str(error):
+        return " ".join(str(error).split())[:160]
+    return "it is damaged, cut off or of another kind"

@@ -115,6 +115,7 @@ FORMATS = (
     Format("cameras", "gvhmr", "slam_results.pt of GVHMR", "people.paths:read_slam"),
     Format("cameras", "megasam", "*_sgd_cvd_hr.npz of MegaSaM", "people.paths:read_megasam"),
     Format("cameras", "tum", "a trajectory in TUM's format", "people.paths:read_tum"),
+    Format("cameras", "vggt", "predictions.npz of VGGT", "people.paths:read_vggt"),
     Format("cameras", "vipe", "a folder of ViPE", "people.paths:read_vipe"),
     Format("cameras", "wham", "slam_results.pth of WHAM", "people.paths:read_slam"),
     Format(

@@ -33,7 +33,7 @@ from mover.io.capture.folder import folder_parts
 from mover.io.capture.scene_file import write_hypotheses, write_scene
 from mover.io.files.cameras import guessed_view, of_view, read_camera_file, with_spread
 from mover.io.files.fields import At, get, maybe, number, read_json, write_json
-from mover.io.files.images import find_depth_file, opened, read_depth, write_image
+from mover.io.files.images import find_depth_file, opened, read_depth, reference_frame, write_image
 from mover.io.people.keypoints import write_keypoints
 from mover.perceive.config import Lens, ModelsConfig, PerceiveConfig
 from mover.perceive.layout import FirstScene, Picture
@@ -372,7 +372,9 @@ def read_picture_of(folder: Path) -> Picture:
         masks=torch.stack(masks) if masks else blank[None][:0],
         people=hidden,
         height=None if known is None else number(known, 0.1, 100.0),
-        depth=None if depth is None or not depth[1] else read_depth(depth[0], camera),  # in metres
+        depth=None
+        if depth is None or not depth[1]  # in metres
+        else read_depth(depth[0], camera, frame=reference_frame(folder)),
         reference=None if parts.load_image is None else parts.load_image(camera),
     )
 

@@ -16,10 +16,9 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from mover.core.errors import InputError
-from mover.core.files import replacing
+from mover.core.files import reason, replacing
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import fingerprint, record
-from mover.io.files.fields import reason
 from mover.io.files.images import opened
 from mover.io.people.values import natural
 from mover.perceive.config import FramesConfig
@@ -153,7 +152,7 @@ def read_frames(source: Path, config: FramesConfig) -> Iterator[Timed]:
         yield from _decoded(source)
     except (OSError, ValueError) as error:  # av's errors are of both kinds
         raise InputError(
-            f"{source.name}: cannot be read ({reason(error)}), expected a video"
+            f"{source.name}: cannot be read ({reason(error, source)}), expected a video"
         ) from error
 
 
@@ -245,7 +244,7 @@ def _opened(source: Path) -> Any:  # noqa: ANN401
         container = av.open(str(source))
     except (OSError, ValueError) as error:
         raise InputError(
-            f"{source.name}: cannot be read ({reason(error)}), expected a video"
+            f"{source.name}: cannot be read ({reason(error, source)}), expected a video"
         ) from error
     if not container.streams.video:
         raise InputError(f"{source.name}: has no pictures, only sound, expected a video")

@@ -103,6 +103,9 @@ def main() -> None:
         say(f"mover: no command {arguments[0]!r}; there are {', '.join(COMMANDS)}\n{USAGE}")
         raise SystemExit(2)
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    said: set[str] = set()
+    for handler in logging.getLogger().handlers:  # each message once
+        handler.addFilter(lambda r: not ((m := r.getMessage()) in said or said.add(m)))
     logging.getLogger("mover.geometry.kernels").setLevel(logging.INFO)  # what is compiled, once
     raise SystemExit(run_command(arguments[0], arguments[1:]))
 

@@ -11,6 +11,7 @@ from tyro.conf import Positional, arg
 
 from mover.app.cli import say
 from mover.app.cli.config import parsed
+from mover.app.cli.people import tracks_of
 from mover.core.errors import InputError
 from mover.core.settings import Index, Rate, float_in
 from mover.io.formats import IMPORTED, chosen, listing
@@ -65,6 +66,8 @@ class ImportArgs:
     """Of the bodies, where the tool gives none: neutral, female or male."""
     fps: Rate | None = None
     """Frames a second of the people's masks and bodies."""
+    tracks: tuple[str, ...] = ()
+    """New numbers of the bodies' tracks, as 7=1 0=2; those with one number are one person."""
     up: str = ""
     """Which way is up in a glTF scene or in boxes: y, -y or z."""
     names: tuple[str, ...] = ()
@@ -135,9 +138,12 @@ def _names(given: Sequence[str]) -> dict[str, str]:
 def _parts(args: ImportArgs, main: "Parts", hints: "Hints") -> "list[Parts]":
     """The source and what the options add."""
     import numpy as np
+    import torch
 
     from mover.io.capture.bodies_file import read_body_arrays
     from mover.io.capture.parts import Parts, image_parts
+    from mover.io.capture.tracks import renumbered
+    from mover.io.files.fields import At, array, get
     from mover.io.files.npz import read_npz
 
     found = [main]
@@ -149,6 +155,10 @@ def _parts(args: ImportArgs, main: "Parts", hints: "Hints") -> "list[Parts]":
         extra = dataclasses.replace(extra, load_image=load, image_size=size)
     if args.bodies is not None:
         bodies = read_body_arrays(args.bodies, args.fps) if not args.bodies_from else None
+        if bodies is not None and args.tracks:
+            person = renumbered(torch.from_numpy(array(get(bodies, "person"), ("B",), "whole")),
+                                tracks_of(args.tracks))  # fmt: skip
+            bodies = At({**bodies.value, "person": person.numpy()}, bodies.file)
         bodies = bodies or _bodies_of_tool(args, [*found, extra], hints)
         extra = dataclasses.replace(extra, bodies=bodies)
     if args.cameras is not None:
@@ -173,9 +183,8 @@ def _bodies_of_tool(args: ImportArgs, parts: "Sequence[Parts]", hints: "Hints") 
     assert args.bodies is not None
     chosen("--bodies-from", args.bodies_from, "people")
     lens = next((p.camera for p in reversed(parts) if p.camera is not None), hints.camera)
-    known = Known(
-        camera=None if lens is None else camera_of(lens), fps=args.fps, gender=args.gender
-    )
+    camera = None if lens is None else camera_of(lens)
+    known = Known(camera, fps=args.fps, gender=args.gender, tracks=tracks_of(args.tracks))
     found = bodies_from(args.bodies_from, args.bodies, known)
     for text in found.warnings:
         say(f"note: {text}")

@@ -1,6 +1,7 @@
 """What `import-bodies` and `fit` do."""
 
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -43,6 +44,8 @@ class BodiesArgs:
     """The number in the name of the first frame's file, 1 where they count from 1."""
     vposer: Path | None = None
     """VPoser's weights (a checkpoint or its folder), for codes that SMPLify-X stored."""
+    tracks: tuple[str, ...] = ()
+    """New numbers of tracks, as 4=0 17=0; those with one number are one person."""
 
 
 def bodies(arguments: Sequence[str]) -> None:
@@ -53,7 +56,7 @@ def bodies(arguments: Sequence[str]) -> None:
     if args.tool not in names("people", "keypoints"):
         known = ", ".join(names("people", "keypoints"))
         raise InputError(f"TOOL: {args.tool!r} is none of {known}")
-    from mover.io.capture.bodies_file import write_bodies
+    from mover.io.capture.bodies_file import odd_bodies, write_bodies
     from mover.io.capture.camera_file import camera_of
     from mover.io.files.cameras import read_camera_file
     from mover.io.people.bodies import bodies_from
@@ -61,7 +64,8 @@ def bodies(arguments: Sequence[str]) -> None:
     from mover.io.people.keypoints import keypoints_from, write_keypoints
 
     camera = None if args.camera is None else camera_of(read_camera_file(args.camera, None))
-    known = Known(camera, args.focal, args.faces, args.fps, args.gender, args.first)
+    tracks = tracks_of(args.tracks)
+    known = Known(camera, args.focal, args.faces, args.fps, args.gender, args.first, tracks=tracks)
     if args.vposer is not None:
         from mover.fitting.prior import load_vposer, vposer_prior
 
@@ -75,11 +79,19 @@ def bodies(arguments: Sequence[str]) -> None:
     found = bodies_from(args.tool, args.source, known)
     people, out = found.bodies, args.out or Path("bodies.npz")
     write_bodies(people, out)
-    for warning in found.warnings:
+    odd = [f"{args.source.name}: {text}" for text in odd_bodies(people)]
+    for warning in (*found.warnings, *odd):
         say(f"warning: {warning}")
     model = "meshes only" if people.pose is None else f"parameters of {people.pose.model}"
     rows = f"{len(people.frame)} rows, {_counted(people)}"
     say(f"{rows}, {people.verts.shape[1]} vertices, {model}: {out}")
+
+
+def tracks_of(given: Sequence[str]) -> dict[int, int]:
+    """`4=0` as a table."""
+    if odd := [text for text in given if not re.fullmatch("[0-9]{1,8}=[0-9]{1,8}", text)]:
+        raise InputError(f"--tracks: has {odd[0]!r}, expected old and new number as 4=0")
+    return {int(old): int(new) for old, _, new in (text.partition("=") for text in given)}
 
 
 def _counted(found: Any) -> str:  # noqa: ANN401

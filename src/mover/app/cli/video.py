@@ -75,13 +75,18 @@ def take_depth(depth: Path, capture: Path) -> None:
         InputError: If there is no such file, or the capture has an inverse depth.
     """
     from mover.core.files import copy_whole
-    from mover.io.files.images import DEPTH, find_depth_file
+    from mover.io.capture.camera_file import camera_of
+    from mover.io.files.fields import read_json
+    from mover.io.files.images import DEPTH, find_depth_file, read_depth, reference_frame
 
     if not depth.is_file():
         raise InputError(f"{depth}: there is no such file, expected a depth map")
     if not capture.is_dir():
         raise InputError(f"{capture}: there is no such folder, expected a capture")
     place = capture / DEPTH / f"000000{depth.suffix.lower()}"
+    if (capture / "camera.json").is_file():  # so that what is wrong is named by the user's file
+        read_depth(depth, camera_of(read_json(capture / "camera.json")),
+                   frame=reference_frame(capture))  # fmt: skip
     if depth.resolve() != place.resolve():
         for old in (capture / DEPTH).glob("000000.*"):
             old.unlink()

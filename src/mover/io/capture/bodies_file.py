@@ -1,9 +1,7 @@
 """bodies.npz: people's meshes, or the parameters of a body model, or both."""
 
-import contextlib
 import logging
 import re
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +13,6 @@ from torch import Tensor
 
 from mover.bodies.corrected import has_mean_shape
 from mover.core.errors import InputError
-from mover.core.records import BROKEN
 from mover.core.types import Bodies
 from mover.io.capture.pose_file import pose_of, pose_to_arrays, posed, reproduces
 from mover.io.files.fields import (
@@ -32,11 +29,15 @@ from mover.io.files.fields import (
     refuse,
 )
 from mover.io.files.meshes import check_faces
-from mover.io.files.npz import read_npy, read_npz, write_npz
+from mover.io.files.npz import AMASS, is_amass, read_npy, read_npz, write_npz
+from mover.io.formats import names
+from mover.io.people.values import named
 
 log = logging.getLogger(__name__)
 
 TALLEST, SMALLEST = 3.5, 0.2  # [m], of a body that is in metres
+SMALL = 1.1  # [m] across, of small people at their largest
+ON_HEAD = 0.3  # [m], heads so far below ankles
 
 
 def read_bodies(path: Path, warn: Warn = log.warning) -> Bodies:
@@ -48,22 +49,19 @@ def read_body_arrays(path: Path, fps: float | None = None) -> At:
     """The arrays of bodies.npz as they are, with a frame rate where one is given.
 
     Raises:
-        InputError: If it cannot be read, or is a motion of AMASS.
+        InputError: If it cannot be read.
     """
-    names = set[str]()
-    with contextlib.suppress(*BROKEN), zipfile.ZipFile(path) as archive:
-        names = set(archive.namelist())
-    if "poses.npy" in names and "frame.npy" not in names:
-        raise InputError(
-            f"{path.name}: is a motion of AMASS, in a world of its own; expected bodies.npz (name "
-            "the tool: --bodies-from amass, or mover import-bodies amass, reads it upright)"
-        )
+    if path.is_dir() or path.suffix.lower() not in (".npz", ""):
+        cure = f"name the tool that wrote it (--bodies-from {', '.join(names('people'))})"
+        raise InputError(f"{named(path).name}: is no bodies.npz; {cure}")
     at = read_npz(path)
     return at if fps is None else At({**at.value, "fps": np.array(fps)}, at.file)
 
 
 def bodies_of(at: At, warn: Warn) -> Bodies:
     """The bodies of named arrays: meshes where they are given, else the posed model."""
+    if is_amass(at):
+        raise InputError(f"{at.file}: is {AMASS}; expected bodies.npz")
     frame = _indices(get(at, "frame"), "B")
     person = _indices(get(at, "person"), len(frame))
     _check_rows(at, frame, person)
@@ -83,16 +81,38 @@ def bodies_of(at: At, warn: Warn) -> Bodies:
     spread = _scalar(at, "size_spread", 0.0, 1.0)
     mean_shape = pose is not None and has_mean_shape(pose)  # before a pose is dropped unchecked
     fps = _scalar(at, "fps", SLOWEST, FASTEST)
-    extent = float((verts.amax(1) - verts.amin(1)).norm(dim=-1).median())
-    if not SMALLEST < extent < TALLEST:
-        warn(f"{at.file}: the bodies measure {extent:.3g} across; are they in metres?")
     reason = reproduces(pose, verts, at) if given is not None and pose is not None else None
     if reason is not None:
         warn(f"{at.file}: {reason}; the bodies can only be refined rigidly")
         pose = None
-    return Bodies(
+    bodies = Bodies(
         verts, faces, joints, names, frame, person, fps, word, pose, spread, mean_shape
     )  # fmt: skip
+    for text in odd_bodies(bodies):
+        warn(f"{at.file}: {text}")
+    return bodies
+
+
+def odd_bodies(bodies: Bodies) -> list[str]:
+    """What is unlikely of people: other units, small ones, and people on their heads."""
+    found: list[str] = []
+    extent = (bodies.verts.amax(1) - bodies.verts.amin(1)).norm(dim=-1)
+    middle, large = float(extent.median()), float(extent.quantile(0.9))
+    if not SMALLEST < middle < TALLEST:
+        found.append(f"the bodies measure {middle:.3g} across; are they in metres?")
+    elif large < SMALL:
+        cure = "if they are adults, is the focal length that the tool assumed right?"
+        found.append(f"people measure {large:.2g} m across, as small children; {cure}")
+    ends = [bodies.joint_names.index(name) for name in ("head", "left_ankle", "right_ankle")
+            if name in bodies.joint_names]  # fmt: skip
+    if bodies.joints is not None and len(ends) == 3:
+        y = bodies.joints[:, ends, 1] * (1 if bodies.space == "camera" else -1)
+        if float((y[:, 0] - y[:, 1:].mean(1)).median()) > ON_HEAD:
+            cure = "turn the video by 180 degrees, or their axes: " + (
+                "+y must point down in the camera" if bodies.space == "camera" else "+y is up"
+            )
+            found.append(f"people stand on their heads; {cure}")
+    return found
 
 
 def _indices(at: At, count: int | str) -> Int[Tensor, " rows"]:

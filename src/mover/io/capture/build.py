@@ -19,6 +19,8 @@ from mover.io.capture.tracks import pair_tracks, paired
 from mover.io.files.fields import At, Warn, array, get, items, listed, refuse
 from mover.io.files.schema import checked
 
+SLOW, FAST = 2.0, 250.0  # frames a second, of usual videos
+SAME_RATE = 0.01  # relative difference of two rates that are one
 NO_PEOPLE = PeopleFile(None, None, None, frozenset())
 
 
@@ -106,7 +108,14 @@ def _bodies_of(
     if bodies.space == "world":
         # The file's world is that of scene.json, before its heading was taken out.
         bodies = into_camera(bodies, camera.R_cam_world @ rot_y(torch.tensor(turn)))
-    return dataclasses.replace(bodies, fps=fps) if bodies.fps is None else bodies
+    rate = fps if bodies.fps is None else bodies.fps
+    if rate is None and len(bodies.frame.unique()) > 1:
+        warn("bodies.npz: has no frame rate, so the people's speed is not used (give --fps)")
+    elif rate is not None and not SLOW <= rate <= FAST:
+        warn(f"bodies.npz: has {rate:g} frames a second; is that the rate of the video?")
+    if rate is not None and fps is not None and abs(rate / fps - 1) > SAME_RATE:
+        warn(f"bodies.npz: has {rate:g} frames a second, people.json {fps:g}; the bodies' counts")
+    return dataclasses.replace(bodies, fps=rate)
 
 
 def _same_people(

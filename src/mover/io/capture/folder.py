@@ -77,7 +77,8 @@ def _files(folder: Path, needed: Callable[[Path], At | None]) -> Parts:
 
     def load_depth(camera: Camera) -> DepthImage | None:
         found = images.find_depth_file(folder)
-        return found and images.read_depth_image(found[0], camera, metric=found[1])
+        frame = images.reference_frame(folder)
+        return found and images.read_depth_image(found[0], camera, metric=found[1], frame=frame)
 
     frames = folder / "frames"
     files = frames.iterdir() if frames.is_dir() else ()

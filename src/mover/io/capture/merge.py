@@ -11,18 +11,21 @@ from typing import Any
 import torch
 
 from mover.core.errors import InputError
-from mover.core.types import Camera, Capture, Scene, SceneObject
+from mover.core.records import fingerprint, rows_of
+from mover.core.types import Bodies, Camera, Capture, Scene, SceneObject
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import to_camera, to_world
 from mover.geometry.rotations import rot_y
 from mover.io.capture.annotations_file import detections_of, people_of
-from mover.io.capture.bodies_file import bodies_of, write_bodies
+from mover.io.capture.bodies_file import bodies_of, bodies_to_arrays, write_bodies
 from mover.io.capture.build import build_capture
 from mover.io.capture.camera_file import camera_of, turned
 from mover.io.capture.folder import REFERENCE, folder_parts, read_capture, write_trees
 from mover.io.capture.pairing import linked, named_rows, pair_rows
 from mover.io.capture.parts import UNKNOWN, Parts
-from mover.io.files.fields import At, get, items, maybe, write_json
+from mover.io.capture.pose_file import joined_poses
+from mover.io.capture.tracks import numbers_beside, renumbered
+from mover.io.files.fields import At, get, items, listed, maybe, refuse, write_json
 from mover.io.files.images import write_image
 from mover.io.files.npz import write_npz
 from mover.io.masks.coco import annotations_tree
@@ -76,11 +79,11 @@ def import_into(folder: Path, *given: Parts) -> Imported:
         if new:
             shutil.rmtree(folder, ignore_errors=True)
         raise
-    return Imported(capture, tuple(written), _missing(whole, capture), whole.notes)
+    return Imported(capture, tuple(written), _missing(whole), whole.notes)
 
 
 def _added(old: Parts, new: Parts) -> Parts:
-    """The new parts before the old ones; annotations of both are brought together.
+    """The new parts before the old ones; annotations and bodies of both are brought together.
 
     The newer camera has the tilt and the height of the older one where it has none. The tilt is
     that of the world in which the scene of both is.
@@ -94,13 +97,77 @@ def _added(old: Parts, new: Parts) -> Parts:
         camera = At({**kept, **new.camera.value}, new.camera.file, new.camera.field)
     scene, lens = (old, old.camera) if new.scene is None else (new, new.camera or old.camera)
     tilt = None if scene.scene is None else scene.tilt
+    bodies, notes = _bodies(old.bodies, new.bodies)
     values |= {
-        "name": old.name, "camera": camera, "objects": _objects(old, new),
+        "name": old.name, "camera": camera, "objects": _objects(old, new), "bodies": bodies,
         "tilt": tilt or (None if lens is None else lens.value.get("R_cam_world")),
-        "load_mesh": scene.load_mesh, "notes": (*old.notes, *new.notes),
+        "load_mesh": scene.load_mesh, "notes": (*old.notes, *new.notes, *notes),
         "beside": {**old.beside, **new.beside},
     }  # fmt: skip
     return replace(old, **values)
+
+
+def _bodies(old: At | None, new: At | None) -> tuple[At | None, tuple[str, ...]]:
+    """The bodies of both files, and what is said: people of the newer count where both have them.
+
+    Raises:
+        InputError: If they cannot be in one file.
+    """
+    if old is None or new is None or new is old:
+        return new or old, ()
+    first, second = (bodies_of(at, lambda _: None) for at in (old, new))
+    if fingerprint(first) == fingerprint(second):
+        return old, ()
+    if first.space != second.space:
+        refuse(get(new, "space"), f"{first.space!r}, as the bodies that are there")
+    numbers, same = numbers_beside(first, second)
+    second = replace(second, person=renumbered(second.person, numbers))
+    kept = torch.ones(len(first.frame), dtype=torch.bool)
+    for one in same:
+        frame = second.frame[second.person == one]
+        kept &= (first.person != one) | (first.frame < frame.min()) | (first.frame > frame.max())
+    notes = [f"{new.file}: its person {a} is person {b} here" for a, b in numbers.items() if a != b]
+    if again := sorted(same):
+        notes.append(f"{new.file}: replaces {listed('track', again)} of the same people")
+    if not kept.any():
+        return At(bodies_to_arrays(second), new.file), tuple(notes)
+    counts = [one.verts.shape[1] for one in (first, second)]
+    if counts[0] != counts[1] or not torch.equal(first.faces, second.faces):
+        raise InputError(
+            f"{new.file}: has bodies of {counts[1]} vertices, those in the capture {counts[0]}, "
+            "expected one topology (remove its bodies.npz to put these in its place)"
+        )
+    added = sorted({*second.person.tolist()} - same)
+    notes.append(f"{new.file}: adds {listed('track', added)} to bodies.npz" if added else "")
+    whole, lost = _joined(rows_of(first, kept.nonzero()[:, 0]), second)
+    return At(bodies_to_arrays(whole), new.file), (*filter(None, notes), *lost)
+
+
+def _joined(first: Bodies, second: Bodies) -> tuple[Bodies, list[str]]:
+    """Rows of both in the order of their frames, and what of them is left out."""
+    lost, pose = list[str](), None
+    if first.pose is not None and second.pose is not None:
+        pose = joined_poses(first.pose, second.pose)
+    if pose is None and (first.pose is not None or second.pose is not None):
+        lost.append("bodies.npz: their parameters differ in kind, so the meshes alone are kept")
+    if first.fps is not None and second.fps is not None and first.fps != second.fps:
+        lost.append(f"bodies.npz: frame rates {first.fps:g} and {second.fps:g}; the newer counts")
+    same = first.joint_names == second.joint_names
+    both = ((first.joints, second.joints),) if same and first.joints is not None else ()
+    whole = replace(
+        second,
+        verts=torch.cat([first.verts, second.verts]),
+        joints=next((torch.cat([a, b]) for a, b in both if b is not None), None),
+        joint_names=first.joint_names if both else (),
+        frame=torch.cat([first.frame, second.frame]),
+        person=torch.cat([first.person, second.person]),
+        fps=first.fps if second.fps is None else second.fps,
+        pose=pose,
+        size_spread=first.size_spread if first.size_spread == second.size_spread else None,
+        mean_shape=first.mean_shape and second.mean_shape,
+    )
+    order = torch.argsort(whole.person, stable=True)
+    return rows_of(whole, order[torch.argsort(whole.frame[order], stable=True)]), lost
 
 
 def _objects(old: Parts, new: Parts) -> At | None:
@@ -202,11 +269,10 @@ def _camera_of(whole: Parts) -> Camera | None:
     return camera_of(At(fields, "image"))
 
 
-def _missing(whole: Parts, capture: Capture | None) -> tuple[str, ...]:
+def _missing(whole: Parts) -> tuple[str, ...]:
     """What is not there, each with its consequence."""
     rows = [] if whole.objects is None else items(get(whole.objects, "annotations"))
     masked = any(maybe(row, "segmentation") for row in rows)
-    no_rate = capture is not None and capture.bodies is not None and capture.bodies.fps is None
     lacking = {
         "camera.json: the lens (--camera FILE, or --fov DEGREES with --image)": not whole.camera,
         "scene.json and meshes/: a first guess of the furniture (any of the scene formats)":
@@ -217,7 +283,6 @@ def _missing(whole: Parts, capture: Capture | None) -> tuple[str, ...]:
         "bodies.npz: no person moves, so the image alone is used (--bodies)": not whole.bodies,
         "people.json: no depth order from people (--people-masks)": not whole.people,
         "reference.jpg: nothing to draw on (--image)": not whole.load_image,
-        "the frame rate of the bodies: --fps (without it their speed is not used)": no_rate,
     }  # fmt: skip
     return tuple(text for text, is_missing in lacking.items() if is_missing)
 

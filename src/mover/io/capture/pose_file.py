@@ -11,10 +11,11 @@ from torch import Tensor
 
 from mover.bodies import BodyModel, load_model
 from mover.core.errors import InputError
+from mover.core.files import reason
 from mover.core.records import rows_of
 from mover.core.types import Bodies, BodyPose
 from mover.geometry.rotations import axis_angle, rotation_vectors
-from mover.io.files.fields import At, array, choice, get, maybe, reason, refuse
+from mover.io.files.fields import At, array, choice, get, maybe, refuse
 from mover.io.people.values import vectors
 
 NEEDED = ("betas", "global_orient", "body_pose", "transl")
@@ -127,6 +128,21 @@ def pose_to_arrays(pose: BodyPose) -> dict[str, NDArray[Any]]:
     tensors = {key: getattr(pose, key) for key in NEEDED} | pose.extra
     words = {"model": np.array(pose.model), "gender": np.array(pose.gender)}
     return words | {key: value.detach().cpu().numpy() for key, value in tensors.items()}
+
+
+def joined_poses(first: BodyPose, second: BodyPose) -> BodyPose | None:
+    """Parameters of both, shapes filled up with zeros; None if they are of different kinds."""
+    kinds = [(p.model, p.gender, p.body_pose.shape[1], {k: v.shape[1:] for k, v in p.extra.items()})
+             for p in (first, second)]  # fmt: skip
+    if kinds[0] != kinds[1]:
+        return None
+    most = max(p.betas.shape[1] for p in (first, second))
+    betas = [
+        torch.nn.functional.pad(p.betas, (0, most - p.betas.shape[1])) for p in (first, second)
+    ]
+    rest = {name: torch.cat([getattr(first, name), getattr(second, name)]) for name in NEEDED[1:]}
+    extra = {name: torch.cat([value, second.extra[name]]) for name, value in first.extra.items()}
+    return BodyPose(first.model, first.gender, torch.cat(betas), **rest, extra=extra)
 
 
 # Parameters of bodies: posed, and moved as rigid bodies, whose root turns about the pelvis.

@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
+from torch import Tensor
 
 from mover.core.types import Bodies, Camera, Masks, People
 from mover.geometry.camera import NEAR, project
@@ -16,6 +18,14 @@ OVERLAP = 0.5  # of a body and a mask of one person, mean of share and union
 CLEAR = 0.3  # by so much the next best pair is worse where there is no uncertainty
 TOGETHER = 0.2  # share of the shorter track's frames in which both are seen
 POINTS = 1000  # vertices of a body that give its box
+PATIENCE = 15  # frames that a person may be lost for
+FEW = 5  # rows that show the motion at the end of a track
+REACH, DRIFT = 0.25, 0.02  # [m], and a frame: so far from where the motion leads
+DEPTH = 0.1  # the same along the view, as a share of the distance
+SHAPES = 2.0  # difference of the shapes of two people
+TALL = 1.7  # [m], a person's size
+ONE_PLACE = 0.35  # of a person's size: so near are two estimates of one person
+LEAST_WAY, WALK = 1.0, 0.07  # [m], and a frame: so far one can have walked unseen
 
 Track = tuple[str, int]
 """`bodies` or `masks`, and its number."""
@@ -98,7 +108,7 @@ def paired(bodies: Bodies, people: People, pairs: Pairs) -> tuple[Bodies, People
     )
 
 
-def renumbered(person: torch.Tensor, numbers: Mapping[int, int]) -> torch.Tensor:
+def renumbered(person: Int[Tensor, " rows"], numbers: Mapping[int, int]) -> Int[Tensor, " rows"]:
     """Tracks under their new numbers; those without one stay."""
     return torch.tensor([numbers.get(one, one) for one in person.tolist()], dtype=person.dtype)
 
@@ -130,3 +140,158 @@ def _overlaps(ours: NDArray[np.float64], theirs: NDArray[np.float64]) -> NDArray
     a, b = (np.prod(box[:, 2:] - box[:, :2], axis=1) for box in (ours, theirs))
     inside = common / np.maximum(b, 1e-9)
     return (inside + common / np.maximum(a[:, None] + b - common, 1e-9)) / 2
+
+
+# Pieces of one person's track, as trackers leave them behind a pillar or at the image's border.
+
+
+@dataclass(frozen=True)
+class _End:
+    """Where a track begins or ends, and how it moves there [m, m a frame]."""
+
+    frame: int
+    place: NDArray[np.float64]
+    speed: NDArray[np.float64]
+    shape: NDArray[np.float64]
+
+
+def join_pieces(
+    frame: Int[Tensor, " rows"],
+    person: Int[Tensor, " rows"],
+    place: Float[Tensor, "rows 3"],
+    betas: Float[Tensor, "rows shape"] | None = None,
+) -> tuple[dict[int, int], list[str]]:
+    """Join tracks that continue another after a few frames, where both motions lead there.
+
+    Two people cannot change places within `PATIENCE` frames. A track with two that could continue
+    it is not joined; it is named, as are those which one person could have walked between.
+
+    Args:
+        frame: Frames of the rows.
+        person: Their tracks.
+        place: Positions in the camera frame [m].
+        betas: Shapes, where the tool estimates them.
+
+    Returns:
+        New numbers of tracks that continue others, and what is said of them.
+    """
+    shapes = torch.zeros(len(frame), 1) if betas is None else betas
+    rows = torch.cat([place.double(), shapes.double()], 1).numpy()
+    begins, ends = dict[int, _End](), dict[int, _End]()
+    for one in person.unique().tolist():
+        own = (person == one).nonzero()[:, 0]
+        own = own[frame[own].argsort()]
+        begins[one], ends[one] = (
+            _end(frame[part].numpy(), rows[part.numpy()])
+            for part in (own[:FEW], own[-FEW:].flip(0))
+        )
+    after = {a: [b for b in begins if _continues(ends[a], begins[b])] for a in ends}
+    follows: dict[int, int] = {}
+    for a, options in after.items():
+        near = min(options, key=lambda b: begins[b].frame, default=None)
+        if near is None or any(begins[b].frame <= ends[near].frame for b in options if b != near):
+            continue
+        others = [c for c, theirs in after.items() if near in theirs and c != a]
+        if not any(ends[c].frame >= begins[a].frame for c in others):
+            follows[near] = a
+    numbers: dict[int, int] = {}
+    for b in sorted(follows, key=lambda b: begins[b].frame):
+        numbers[b] = numbers.get(follows[b], follows[b])
+    notes: list[str] = []
+    for first in dict.fromkeys(numbers.values()):
+        chain = ", ".join(map(str, [first, *(b for b in numbers if numbers[b] == first)]))
+        notes.append(f"tracks {chain} follow one another in time and position: one person, {first}")
+    return numbers, notes + _possible(begins, ends, follows)
+
+
+def _end(frame: NDArray[np.int64], rows: NDArray[np.float64]) -> _End:
+    """The first of these rows, with the motion that the others show."""
+    span = frame[-1] - frame[0]
+    speed = (rows[-1, :3] - rows[0, :3]) / span if span else np.zeros(3)
+    return _End(int(frame[0]), rows[0, :3], speed, rows[:, 3:].mean(0))
+
+
+def _continues(end: _End, begin: _End) -> bool:
+    """Whether a track can be the other's continuation, by where the motions of both lead."""
+    gap = begin.frame - end.frame
+    if not 0 < gap <= PATIENCE or np.linalg.norm(begin.shape - end.shape) > SHAPES:
+        return False
+    reach = REACH + DRIFT * gap
+    for one, other, time in ((end, begin, gap), (begin, end, -gap)):
+        led = one.place + one.speed * time
+        off = np.abs(led[:2] - other.place[:2] * led[2] / other.place[2])
+        deep = abs(led[2] - other.place[2]) - DEPTH * abs(led[2])  # depths are uncertain
+        if max(float(np.linalg.norm(off)), deep) > reach:
+            return False
+    return True
+
+
+def _possible(
+    begins: Mapping[int, _End], ends: Mapping[int, _End], joined: Mapping[int, int]
+) -> list[str]:
+    """Tracks that one person could have walked between, each with the nearest in time."""
+    found: list[str] = []
+    cure = ""
+    for b in sorted(set(begins) - set(joined), key=lambda b: begins[b].frame):
+        gaps = {a: begins[b].frame - ends[a].frame for a in set(ends) - set(joined.values())}
+        near = {a: gap for a, gap in gaps.items() if gap > 0 and LEAST_WAY + WALK * gap
+                >= np.linalg.norm(begins[b].place - ends[a].place)}  # fmt: skip
+        if near:
+            a = min(near, key=near.__getitem__)
+            found.append(f"{a} and {b} (frames {ends[a].frame} and {begins[b].frame})")
+            cure = cure or f"--tracks {b}={a} would make the first two one"
+    more = f" and {len(found) - 6} more pairs" if len(found) > 6 else ""
+    return [f"tracks {', '.join(found[:6])}{more} may be one person; {cure}"] if found else []
+
+
+# Two files of bodies: people who are in both, and people who are new.
+
+
+def numbers_beside(old: Bodies, new: Bodies) -> tuple[dict[int, int], set[int]]:
+    """Numbers of the tracks of a second file beside those of a first.
+
+    One who is at the same positions in shared frames, or continues a track, has its number; another
+    person with a number that is taken gets a free one.
+
+    Returns:
+        New numbers by old ones, and those that were in the first file in the same frames.
+    """
+    places = [_seen_at(one) for one in (old, new)]
+    taken, given = ({*one.person.tolist()} for one in (old, new))
+    free = unused = 1 + max(taken | given)
+    middles = torch.cat([one.verts.mean(1) for one in (old, new)])
+    later, _ = join_pieces(
+        torch.cat([old.frame, new.frame]), torch.cat([old.person, new.person + free]), middles
+    )
+    rows = {pair: k for k, pair in enumerate(zip(*(x.tolist() for x in (old.frame, old.person)),
+                                                 strict=True))}  # fmt: skip
+    numbers, same = dict[int, int](), set[int]()
+    for track in sorted(given):
+        offs: dict[int, float] = {}
+        own = (new.person == track).nonzero()[:, 0].tolist()
+        for other in taken:
+            pairs = [(k, row) for k in own
+                     if (row := rows.get((int(new.frame[k]), other))) is not None]  # fmt: skip
+            if pairs:
+                a, b = torch.tensor(pairs).T
+                off = (places[1][a, :-1] - places[0][b, :-1]).norm(dim=1) / places[0][b, -1]
+                offs[other] = float(off.median())
+        near = min(offs, key=offs.__getitem__, default=None)
+        if near is not None and offs[near] <= ONE_PLACE:
+            numbers[track] = near
+            same.add(near)
+        elif (before := later.get(track + free)) is not None and before in taken - set(offs):
+            numbers[track] = before
+        elif track in taken:
+            numbers[track] = unused
+            unused += 1
+    return numbers, same
+
+
+def _seen_at(bodies: Bodies) -> Float[Tensor, "rows axes"]:
+    """Where people are, in the image where a camera sees them, and last a person's size there."""
+    place = bodies.verts.double().mean(1)
+    if bodies.space == "world":
+        return torch.cat([place, torch.full_like(place[:, :1], TALL)], 1)
+    depth = place[:, 2:].clamp_min(NEAR)
+    return torch.cat([place[:, :2] / depth, TALL / depth], 1)

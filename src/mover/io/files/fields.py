@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
+from mover.core.files import reason, replacing
 
 log = logging.getLogger(__name__)
 Warn = Callable[[str], None]
@@ -59,11 +60,6 @@ def shown(value: Any) -> str:  # noqa: ANN401
         return "a huge number"
     text = json.dumps(value) if isinstance(value, str) else repr(value)
     return text if len(text) <= 60 else f"{text[:56]} ..."
-
-
-def reason(error: Exception) -> str:
-    """What another library says, on one short line."""
-    return " ".join(f"{type(error).__name__}: {error}".split())[:160]
 
 
 def listed(what: str, names: Sequence[object]) -> str:
@@ -181,7 +177,8 @@ def read_json(path: Path) -> At:
         text = path.read_text(encoding="utf-8-sig")
         return At(json.loads(text, object_pairs_hook=_once), name)
     except (ValueError, RecursionError, OSError) as error:
-        raise InputError(f"{name}: is not JSON ({reason(error)}), expected a JSON file") from error
+        why = reason(error, path)
+        raise InputError(f"{name}: is not JSON ({why}), expected a JSON file") from error
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -196,8 +193,6 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def write_json(value: object, path: Path) -> None:
     """Write JSON in one step, always the same bytes for the same value."""
-    from mover.core.files import replacing
-
     body = json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
     with replacing(path) as part:
         part.write_text(body, encoding="utf-8")

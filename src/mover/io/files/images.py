@@ -1,5 +1,6 @@
 """Pictures: the reference image, and its depth as networks give it."""
 
+import logging
 import warnings
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -13,11 +14,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mover.core.errors import InputError
-from mover.core.files import replacing
+from mover.core.files import reason, replacing
 from mover.core.types import Camera, DepthImage
-from mover.io.files.fields import At, array, maybe, reason, refuse
+from mover.io.files.fields import At, array, maybe, refuse
 from mover.io.files.meshes import inside
 from mover.io.files.npz import read_npy, read_npz
+
+log = logging.getLogger(__name__)
 
 
 @contextmanager
@@ -34,6 +37,8 @@ def opened(
     from PIL import Image
 
     try:
+        if not path.is_file():
+            raise FileNotFoundError("there is no such regular file")
         with warnings.catch_warnings():
             warnings.simplefilter(bombs, Image.DecompressionBombWarning)
             with Image.open(path) as picture:
@@ -43,8 +48,8 @@ def opened(
         Image.DecompressionBombWarning,
     ) as error:  # fmt: skip
         if at is not None:
-            refuse(at, expected, f"{str(at.value)!r}, which cannot be read ({reason(error)})")
-        said = f"cannot be read ({reason(error)}), expected {expected}"
+            refuse(at, expected, f"{str(at.value)!r}, which cannot be read ({reason(error, path)})")
+        said = f"cannot be read ({reason(error, path)}), expected {expected}"
         raise InputError(f"{path.name}: {said}") from error
 
 
@@ -96,6 +101,7 @@ DEPTH, DISPARITY = "depth", "disparity"
 NAMES = ("depth", "depth_metric", "metric_depth", "predicted_depth", "depths", "arr_0")
 FARTHEST = 100.0  # [m], what is farther is sky or nonsense
 MILLIMETRES = 1000.0
+SAME_SHAPE = 0.03  # networks cut sides to multiples of 8 or 14 pixels
 ENDINGS = (".npy", ".npz", ".png")
 
 
@@ -103,7 +109,7 @@ def find_depth_file(folder: Path) -> tuple[Path, bool] | None:
     """The measured depth in a capture's folder, and whether it is metric; None: there is none.
 
     `depth/` holds metres (millimetres in a PNG), `disparity/` the inverse depth of a relative
-    network; the file is of the reference picture, the first by name.
+    network; the file is of the reference picture, or the first by name.
 
     Raises:
         InputError: If both are there, or a folder holds no depth map.
@@ -116,12 +122,24 @@ def find_depth_file(folder: Path) -> tuple[Path, bool] | None:
     files = sorted(p for p in (folder / there[0]).iterdir() if p.suffix.lower() in ENDINGS)
     if not files:
         raise InputError(f"{there[0]}/: has no depth map, expected 000000{' or '.join(ENDINGS)}")
-    return files[0], there[0] == DEPTH
+    number = reference_frame(folder)
+    named = (p for p in files if p.stem.isdigit() and int(p.stem) == number)
+    return next(named, files[0]), there[0] == DEPTH
 
 
-def read_depth_image(path: Path, camera: Camera, *, metric: bool) -> DepthImage:
+def reference_frame(folder: Path) -> int:
+    """The frame that a capture's reference picture shows, by cameras.npz; 0 without it."""
+    if not (folder / "cameras.npz").is_file():
+        return 0
+    at = read_npz(folder / "cameras.npz")
+    given = maybe(at, "reference") or maybe(at, "frame")
+    value = np.zeros(1) if given is None else np.asarray(given.value).reshape(-1)
+    return int(value[0]) if value.size and value.dtype.kind in "iu" else 0
+
+
+def read_depth_image(path: Path, camera: Camera, *, metric: bool, frame: int = 0) -> DepthImage:
     """The measured depth of the reference picture."""
-    return DepthImage(read_depth(path, camera, metric=metric), metric)
+    return DepthImage(read_depth(path, camera, metric=metric, frame=frame), metric)
 
 
 def write_depth_image(depth: DepthImage, folder: Path) -> None:
@@ -132,26 +150,29 @@ def write_depth_image(depth: DepthImage, folder: Path) -> None:
         np.save(file, values, allow_pickle=False)
 
 
-def read_depth(path: Path, camera: Camera, *, metric: bool = True) -> Float[Tensor, "h w"]:
+def read_depth(
+    path: Path, camera: Camera, *, metric: bool = True, frame: int = 0
+) -> Float[Tensor, "h w"]:
     """Distance along the view of each pixel [m], or inverse depth; NaN where it is unknown.
 
-    `.npz` and `.npy` hold metres (`depth`, or MoGe's `points`, whose z counts); `.png` with 16
-    bits holds millimetres. Another resolution of the same shape is stretched. Inverse depth is
-    known up to a factor and a shift, and larger where nearer.
+    `.npz` and `.npy` hold metres (`depth`, or MoGe's `points`, whose z counts), of one frame or of
+    all (MegaSaM, VGGT), of which `frame` is taken; `.png` with 16 bits holds millimetres. Another
+    resolution of the same shape is stretched. Inverse depth is known up to a factor and a shift,
+    and larger where nearer.
     """
     match path.suffix.lower():
         case ".png":
             values = _of_png(path, metric)
         case ".npz":
-            values = _of_npz(path, NAMES if metric else (DISPARITY, *NAMES), metric)
+            values = _of_npz(path, NAMES if metric else (DISPARITY, *NAMES), metric, frame)
         case ".npy":
-            values = _two_axes(read_npy(path))
+            values = _of_frame(read_npy(path), frame)
         case _:
             raise InputError(f"{path.name}: is no depth map, expected .npz, .npy or .png")
     known = np.isfinite(values) & (values > 0) & (values < (FARTHEST if metric else np.inf))
     depth = torch.from_numpy(np.where(known, values, np.nan).astype(np.float32))
     h, w = depth.shape
-    if abs(w * camera.height - h * camera.width) > 0.02 * w * camera.height:
+    if abs(w * camera.height - h * camera.width) > SAME_SHAPE * w * camera.height:
         shape = f"{camera.width} x {camera.height} pixels"
         raise InputError(f"{path.name}: has {w} x {h} values, expected the shape of {shape}")
     rows = ((torch.arange(camera.height) + 0.5) * h / camera.height).long()
@@ -159,7 +180,7 @@ def read_depth(path: Path, camera: Camera, *, metric: bool = True) -> Float[Tens
     return depth[rows][:, columns]
 
 
-def _of_npz(path: Path, names: tuple[str, ...], metric: bool) -> NDArray[np.float64]:
+def _of_npz(path: Path, names: tuple[str, ...], metric: bool, frame: int) -> NDArray[np.float64]:
     at = read_npz(path)
     points = maybe(at, "points")
     found = next((v for n in names if (v := maybe(at, n)) is not None), None)
@@ -167,13 +188,19 @@ def _of_npz(path: Path, names: tuple[str, ...], metric: bool) -> NDArray[np.floa
         return np.asarray(points.value, dtype=np.float64)[..., 2]
     if found is None:
         refuse(at, f"one of the arrays {', '.join(names)} or points", f"{', '.join(at.value)}")
-    return _two_axes(found)
+    return _of_frame(found, frame)
 
 
-def _two_axes(at: At) -> NDArray[np.float64]:
+def _of_frame(at: At, frame: int) -> NDArray[np.float64]:
+    """The depth map of a frame, where there is one for each; axes of length 1 are left out."""
     value = np.asarray(at.value)
     while value.ndim > 2 and 1 in (value.shape[0], value.shape[-1]):
         value = value[0] if value.shape[0] == 1 else value[..., 0]
+    if value.ndim == 3 and value.shape[-1] > 4:
+        if frame >= len(value):
+            refuse(at, f"a depth map of frame {frame}", f"{len(value)} frames")
+        log.warning("depth maps of %d frames: that of frame %d is used", len(value), frame)
+        value = value[frame]
     if value.dtype.kind == "f":  # unknown pixels may be NaN or infinite
         value = np.where(np.isfinite(value), value, 0)
     return array(At(value, at.file, at.field), ("h", "w")).astype(np.float64)

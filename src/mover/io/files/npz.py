@@ -11,53 +11,64 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
-from mover.core.files import replacing
+from mover.core.files import reason, replacing
 from mover.core.records import BROKEN
-from mover.io.files.fields import LARGEST_FILE, At, reason
+from mover.io.files.fields import LARGEST_FILE, At, mapping
 
 
-def read_npz(path: Path, *, without_objects: bool = False) -> At:
-    """The arrays of an .npz file by name.
+class NotPlain:
+    """Stands for an array of Python's objects or of fields, which is refused where it is needed."""
 
-    Args:
-        path: The file.
-        without_objects: Leave arrays of pickled objects out instead of refusing the file.
+    def __repr__(self) -> str:
+        return "no plain numbers (no pickled objects are read)"
+
+
+AMASS = (
+    "a motion of AMASS, in a world of its own and not in a camera: --bodies-from amass, or `mover "
+    "import-bodies amass`, reads it upright, but where people are in the picture it does not say"
+)
+
+
+def is_amass(at: At) -> bool:
+    """Whether these are the arrays of a motion."""
+    keys = mapping(at).keys()
+    return "trans" in keys and "frame" not in keys and not keys.isdisjoint(("poses", "pose_body"))
+
+
+def read_npz(path: Path) -> At:
+    """The arrays of an .npz file by name; one of objects or fields is `NotPlain`.
 
     Raises:
-        InputError: If it is missing, broken, too large, or holds pickled objects.
+        InputError: If it is missing, broken or too large.
     """
     name = path.name
     if not path.is_file():
         raise InputError(f"{name}: there is no such file in {path.parent}, expected an .npz file")
     try:
-        kept = _checked_headers(path, without_objects)
+        odd = _odd_arrays(path)
         with np.load(path, allow_pickle=False) as arrays:
-            return At({key: arrays[key] for key in arrays.files if key in kept}, name)
+            return At({key: odd.get(key) or arrays[key] for key in arrays.files}, name)
     except BROKEN as error:
         raise InputError(
-            f"{name}: cannot be read ({reason(error)}), expected an .npz file"
+            f"{name}: cannot be read ({reason(error, path)}), expected an .npz file"
         ) from error
 
 
-def _checked_headers(path: Path, without_objects: bool) -> set[str]:
-    """Names of the arrays, whose promised sizes and types are checked before any is unpacked."""
-    total, kept = 0, set[str]()
+def _odd_arrays(path: Path) -> dict[str, NotPlain]:
+    """Arrays that are not plain; sizes that are promised are checked before any is unpacked."""
+    total, odd = 0, dict[str, NotPlain]()
     with zipfile.ZipFile(path) as archive:
         for entry in archive.infolist():
             with archive.open(entry) as stream:
                 dtype, size = _header(stream)
             total += size
             key = entry.filename.removesuffix(".npy")
-            if dtype.hasobject and without_objects:
-                continue
-            kept.add(key)
             if dtype.hasobject or dtype.fields:
-                found = f"has {dtype}, expected plain numbers or text (no pickled objects)"
-                raise InputError(f"{path.name}: field '{key}' {found}")
+                odd[key] = NotPlain()
             if total > LARGEST_FILE:
                 found = f"has {total} bytes or more, expected at most {LARGEST_FILE} in the file"
                 raise InputError(f"{path.name}: field '{key}' {found}")
-    return kept
+    return odd
 
 
 def _header(stream: Any) -> tuple[np.dtype[Any], int]:  # noqa: ANN401
@@ -77,6 +88,8 @@ def read_npy(path: Path) -> At:
     Raises:
         InputError: If it is missing, broken, promises more than it has or holds pickled objects.
     """
+    if not path.is_file():
+        raise InputError(f"{path.name}: there is no such regular file in {path.parent}")
     try:
         with path.open("rb") as file:
             dtype, size = _header(file)
@@ -90,7 +103,7 @@ def read_npy(path: Path) -> At:
             return At(np.load(file, allow_pickle=False), path.name)
     except BROKEN as error:
         raise InputError(
-            f"{path.name}: cannot be read ({reason(error)}), expected an .npy file"
+            f"{path.name}: cannot be read ({reason(error, path)}), expected an .npy file"
         ) from error
 
 

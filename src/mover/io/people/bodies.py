@@ -13,11 +13,13 @@ from mover.core.errors import InputError
 from mover.core.records import record
 from mover.core.types import Bodies, BodyPose
 from mover.io.capture.pose_file import NEEDED, run_model
+from mover.io.capture.tracks import TALL, join_pieces, renumbered
 from mover.io.files.fields import LARGEST, At, listed
 from mover.io.files.meshes import read_mesh
 from mover.io.formats import chosen as format_of
-from mover.io.people.found import Found, Known
+from mover.io.people.found import UNTRACKED, Found, Known, followed
 from mover.io.people.lens import refocused
+from mover.io.people.values import named
 
 
 @record
@@ -37,18 +39,22 @@ def bodies_from(tool: str, path: Path, known: Known | None = None) -> ImportedBo
         InputError: If the tool is not known, its files are not as it writes them, no row is left,
             a person is twice in a frame, or a file of a body model is missing.
     """
-    known, path = known or Known(), Path(path)
+    known, path = known or Known(), named(Path(path))
     found: Found = format_of("tool", tool, "people")(path, known)
     file = path.name
     warnings = [f"{file}: {text}" for text in found.warnings]
-    found = _in_order(_sound(found, file, warnings), file)
+    found = _tracked(_sound(found, file, warnings), known, file, warnings)
+    found = _in_order(found, file)
     values = found.values
     model = None if "verts" in values else load_model(found.model, found.gender)
     if model is None:
         pose, verts, joints = None, values["verts"], None
     else:
         pose = _posed_as(model, found)
-        verts, joints = run_model(model, pose)
+        try:
+            verts, joints = run_model(model, pose)
+        except InputError as error:
+            raise InputError(f"{file}: {error}") from error
     assumed = values["K"].median(0).values if "K" in values else None
     lens = assumed if known.camera is None else known.camera.K.float()
     if known.camera is not None and "K" in values:
@@ -79,7 +85,7 @@ def _sound(found: Found, file: str, warnings: list[str]) -> Found:
     """Without the rows in which the tool failed."""
     for key, name in (("frames", "frame"), ("tracks", "person")):
         first = int(found.values[name].min())
-        if first < 0:
+        if first < (UNTRACKED if name == "person" else 0):
             raise InputError(f"{file}: {key} are numbered from {first}, expected from 0")
     fine = torch.stack(  # false for NaN as well
         [(value.flatten(1).abs() <= LARGEST).all(1) for value in found.values.values()
@@ -93,6 +99,26 @@ def _sound(found: Found, file: str, warnings: list[str]) -> Found:
         bad = found.values["frame"][~fine].tolist()
         warnings.append(f"{file}: left out NaN in {listed('frame', bad)}")
     return found.chosen(fine.nonzero()[:, 0])
+
+
+def _tracked(found: Found, known: Known, file: str, warnings: list[str]) -> Found:
+    """With one track for each person: of people in pieces, and of those whom no tool follows."""
+    values, person = found.values, found.values["person"]
+    frame, place = (
+        values["frame"],
+        values["verts"].mean(1) if "verts" in values else values["transl"],
+    )
+    if (person == UNTRACKED).all() and len(frame.unique()) < len(frame):
+        size = TALL / place[:, 2:].double().clamp_min(0.1)  # in the image, as depths are uncertain
+        at = torch.cat([place[:, :2].double() / place[:, 2:].double().clamp_min(0.1), size], 1)
+        person = torch.from_numpy(followed(frame.tolist(), at.numpy(), size[:, 0].numpy()))
+        warnings.append(f"{file}: has no tracks, so people are followed by their positions")
+    person = renumbered(person.clamp_min(0), known.tracks)
+    if found.space == "camera":
+        numbers, notes = join_pieces(frame, person, place, values.get("betas"))
+        person = renumbered(person, numbers)
+        warnings += [f"{file}: {note}" for note in notes]
+    return dataclasses.replace(found, values={**values, "person": person})
 
 
 def _in_order(found: Found, file: str) -> Found:

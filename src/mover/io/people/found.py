@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -15,6 +15,8 @@ from torch import Tensor
 from mover.core.errors import InputError
 from mover.core.types import Camera
 
+UNTRACKED = -1
+"""Track of people whom a tool lists image by image."""
 PATIENCE = 15  # a person who is gone for so many frames starts a new track
 REACH = 0.6  # of a person's size: how far one may move from frame to frame
 GROWTH = 0.25  # `REACH` grows by this share with each frame of a gap
@@ -40,6 +42,8 @@ class Known:
     """Frames by the names of files or folders; None: by the numbers in them, less `first`."""
     decode: Callable[[Tensor], Tensor] | None = None
     """Angles of the 21 joints from VPoser's codes, where the user has its weights."""
+    tracks: Mapping[int, int] = field(default_factory=dict[int, int])
+    """New numbers of tracks by old ones; two that become one are one person."""
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from mover.io.files.fields import (
 from mover.io.files.npz import read_npz, write_npz
 from mover.io.formats import chosen
 from mover.io.people.found import Known, followed
-from mover.io.people.values import either, files_of, need, number_in, numbers, tensor
+from mover.io.people.values import either, files_of, named, need, number_in, numbers, tensor
 
 _NAMES = ("openpose25", "openpose137", "coco17", "halpe26", "mediapipe33")
 LAYOUTS = {name: len(JOINTS[name]) for name in _NAMES}
@@ -49,7 +49,7 @@ PARTS = {
 
 def keypoints_from(tool: str, path: Path, known: Known | None = None) -> Keypoints:
     """Keypoints that a detector found."""
-    return chosen("tool", tool, "keypoints")(Path(path), known or Known())
+    return chosen("tool", tool, "keypoints")(named(Path(path)), known or Known())
 
 
 @dataclass(frozen=True)

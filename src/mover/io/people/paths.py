@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
+from mover.core.files import reason
 from mover.core.records import BROKEN
 from mover.geometry.rotations import affine
-from mover.io.files.fields import At, reason, refuse
+from mover.io.files.fields import At, refuse
 from mover.io.people import values as v
 from mover.io.people.values import need
 
@@ -45,6 +46,15 @@ def read_megasam(path: Path) -> At:
     """MegaSaM: NAME_sgd_cvd_hr.npz, or NAME_droid.npz of its first stage."""
     at = v.read_any(v.only_file(path, "*_sgd_cvd_hr.npz", "MegaSaM's result"))
     T = v.stacked(need(at, "cam_c2w"), 4, 4)
+    K = v.rows(need(at, "intrinsic"), None, 9, 3).reshape(-1, 9)
+    return _arrays(at.file, T, np.arange(len(T)), K[:, 0] / (2 * K[:, 2]))
+
+
+def read_vggt(path: Path) -> At:
+    """VGGT: predictions.npz with `extrinsic` (N, 3, 4), world to camera, and `intrinsic`."""
+    at = v.read_any(v.only_file(path, "*.npz", "VGGT's predictions"))
+    given = v.stacked(need(at, "extrinsic"), 3, 4)
+    T = np.linalg.inv(affine(given[:, :, :3], given[:, :, 3]))
     K = v.rows(need(at, "intrinsic"), None, 9, 3).reshape(-1, 9)
     return _arrays(at.file, T, np.arange(len(T)), K[:, 0] / (2 * K[:, 2]))
 
@@ -97,6 +107,9 @@ def read_colmap(path: Path) -> At:
         InputError: If a line has another form, or two pictures are one frame.
     """
     file = path / "images.txt" if path.is_dir() else path
+    if file.suffix == ".bin" or (not file.exists() and file.with_suffix(".bin").exists()):
+        cure = "`colmap model_converter --output_type TXT` writes images.txt"
+        raise InputError(f"{file.with_suffix('.bin').name}: is COLMAP's binary model; {cure}")
     # Each picture has two lines, the second, of its points, may be empty.
     known = [line.split(maxsplit=9) for number, line in _lines(file) if number % 2 == 0]
     names = {str(Path(row[9]).with_suffix("")): row for row in known if len(row) == 10}
@@ -122,7 +135,7 @@ def _lines(file: Path) -> list[tuple[int, str]]:
     try:
         text = v.existing(file).read_text(encoding="utf-8-sig")
     except BROKEN as error:
-        raise InputError(f"{file.name}: cannot be read ({reason(error)})") from error
+        raise InputError(f"{file.name}: cannot be read ({reason(error, file)})") from error
     lines = [line for line in text.splitlines() if not re.match(r"\s*#", line)]
     return [(number, line) for number, line in enumerate(lines) if line.strip()]
 

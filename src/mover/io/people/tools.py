@@ -23,9 +23,8 @@ from mover.core.errors import InputError
 from mover.core.types import BodyPose
 from mover.io.capture.pose_file import GENDERS, NEEDED, moved
 from mover.io.files.fields import At, get, items, mapping, refuse
-from mover.io.files.npz import read_npz
 from mover.io.people import values as v
-from mover.io.people.found import Found, Known, followed, joined
+from mover.io.people.found import UNTRACKED, Found, Known, joined
 from mover.io.people.lens import assumed_lens, from_weak, lens, lens_of, movement, tilting
 from mover.io.people.values import either, need
 
@@ -43,9 +42,9 @@ CODE = 32  # numbers of a VPoser code
 SHAPES = 10  # coefficients where none are given
 FOCAL = 5000.0  # [px], SMPLify-X's default, and of HMR2's crops
 CROP = 256.0  # [px], a side of these crops
-TALL = 1.7  # [m], a person's size, by which people are followed from image to image
 AMASS = {156: "smplh", 165: "smplx", 72: "smpl"}
 """Body models by the numbers of a row of `poses`."""
+NO_CAMERA = "is a motion in a world of its own: where the camera saw the people is not known"
 Y_UP = np.array([[1, 0, 0, 0, 0, 1, 0, -1, 0]])  # AMASS has +z up
 
 
@@ -54,8 +53,8 @@ class Person:
     """One person, with a row for each frame."""
 
     fields: At
-    track: Any = 0
-    """A number, or one a row."""
+    track: int | None = 0
+    """None: the tool lists the people of each image by themselves."""
     frame: int = 0
     """Of the first row, where no field holds the frames."""
     K: At | None = None
@@ -126,7 +125,7 @@ def _rows(tool: Tool, person: Person, known: Known) -> Found:
         pose = moved(pose, v.tensor(R).reshape(-1, 3, 3), v.tensor(t))
     values = {name: getattr(pose, name) for name in NEEDED} | dict(extra)
     values["frame"] = torch.from_numpy(frames)
-    values["person"] = torch.as_tensor(person.track).expand(count)
+    values["person"] = torch.tensor([UNTRACKED if person.track is None else person.track] * count)
     if person.K is not None:
         values["K"] = v.tensor(v.rows(person.K, count, 9)).reshape(-1, 3, 3)
     fps = None if rate is None else v.one_number(rate)
@@ -262,14 +261,14 @@ def pare(path: Path, known: Known) -> Iterator[Person]:
     videos = [path / name for name in names if (path / name).is_file()]
     files = videos[:1] or v.files_of(path, "*.pkl", "PARE's results")
     for k, file in enumerate(files):
-        at, people = v.read_any(file), list[tuple[Any, At]]()
+        at, people = v.read_any(file), list[tuple[int | None, At]]()
         if either(at, "orig_cam", "pred_pose") is None:  # of a video: people by track
             people += v.people_of(at)
         else:
             count = len(v.rows(need(at, "orig_cam"), None, 4))
             frame = v.number_in(file.stem, k) - known.first if path.is_dir() else 0
             fields = {**mapping(at), "frame_ids": np.full(count, frame)}
-            people.append((torch.arange(count), At(fields, at.file)))
+            people.append((None, At(fields, at.file)))
         for track, one in people:
             crop = torch.from_numpy(v.rows(need(one, "orig_cam"), None, 4).copy())
             fields = {**mapping(one), "transl": from_weak(crop, known.camera).numpy()}
@@ -312,9 +311,17 @@ def slahmr(path: Path, _: Known) -> Iterator[Person]:
     """The last *_world_results.npz of a folder: arrays of (people, frames, numbers).
 
     track_info.json beside it gives the tracks and the frames in which a person is visible.
+
+    Raises:
+        InputError: If it is the prior's file, or another.
     """
     path = v.files_of(path, "**/*_world_results.npz", "SLAHMR's results")[-1]
     source = v.read_any(path)
+    if "prior_results" in path.name and either(source, "trans") is None:
+        raise InputError(
+            f"{path.name}: is SLAHMR's motion prior, without positions; expected the file "
+            "*_world_results.npz of the same number beside it"
+        )
     shape = v.numbers(need(source, "trans")).shape
     if len(shape) != 3 or 0 in shape:
         raise InputError(f"{source.file}: field 'trans' has shape {shape}, expected (B, T, 3)")
@@ -349,20 +356,20 @@ def _visible(path: Path, count: int, people: int) -> Iterator[tuple[int, int, ND
 def prox(path: Path, known: Known) -> Iterator[Person]:
     """results/<frame>/<person>.pkl or <frame>.pkl of SMPLify-X and PROX, or one such file."""
     files = v.files_of(path, "**/*.pkl", "fits")
-    names: list[tuple[str, int]] = []
+    names: list[str] = []
     for file in files:
         inside = re.fullmatch(r"\d{1,3}", file.stem) and re.search(r"\d", file.parent.name)
-        names.append((file.parent.name, int(file.stem)) if inside else (file.stem, 0))
+        names.append(file.parent.name if inside else file.stem)
     frames = known.frames
     if not path.is_dir():
-        names, frames = [(path.name, 0)], {path.name: 0}
+        names, frames = [path.name], {path.name: 0}
     elif frames is None:
-        numbered = v.frame_numbers((name for name, _ in names), path.name)
+        numbered = v.frame_numbers(names, path.name)
         frames = {name: number - known.first for name, number in numbered.items()}
-    for file, (name, track) in zip(files, names, strict=True):
+    for file, name in zip(files, names, strict=True):
         if name not in frames:
             raise InputError(f"{file}: {name!r} is no frame of the recording")
-        yield Person(v.read_any(file), track, frames[name])
+        yield Person(v.read_any(file), None, frames[name])
 
 
 def smplifyx(path: Path, known: Known) -> Iterator[Person]:
@@ -374,15 +381,12 @@ def smplifyx(path: Path, known: Known) -> Iterator[Person]:
 def amass(path: Path, _: Known) -> Iterator[Person]:
     """Motions of AMASS: one npz a person."""
     for track, file in enumerate(v.files_of(path, "*.npz", "motions of AMASS")):
-        at = read_npz(file, without_objects=True)
+        at = v.read_any(file)
         width = v.rows(need(at, "poses"), len(v.stacked(need(at, "trans"), 3))).shape[1]
         if width not in AMASS:
             refuse(need(at, "poses"), f"rows of {' or '.join(map(str, AMASS))} angles")
         at = At({**mapping(at), "turn": Y_UP, "shift": np.zeros(3)}, at.file, at.field)
-        yield Person(at, track, model=AMASS[width])
-
-
-# SAM 3D Body lists people by image: they are followed from image to image by their positions.
+        yield Person(at, track, model=AMASS[width], warnings=(NO_CAMERA,))
 
 
 def read_sam3dbody(path: Path, known: Known) -> Found:
@@ -407,10 +411,7 @@ def read_sam3dbody(path: Path, known: Known) -> Found:
         seen += [(numbered[image] - known.first, one) for one in listed]
     if not seen:
         raise InputError(f"{path}: has no people, expected at least one")
-    found = joined([_mesh(at, frame, known) for frame, at in seen])
-    middles = found.values["verts"].double().mean(1).numpy()
-    tracks = followed([frame for frame, _ in seen], middles, np.full(len(seen), TALL))
-    return dataclasses.replace(found, values={**found.values, "person": torch.from_numpy(tracks)})
+    return joined([_mesh(at, frame, known) for frame, at in seen])
 
 
 def _mesh(at: At, frame: int, known: Known) -> Found:
@@ -427,7 +428,8 @@ def _mesh(at: At, frame: int, known: Known) -> Found:
         image = v.rows(pixels, len(points), 2)
         if np.isfinite(points).all() and np.isfinite(image).all():
             given = lens_of(v.tensor(points), v.tensor(image))
-    values = {"frame": torch.tensor([frame]), "person": torch.tensor([0]), "verts": verts[None]}
+    values = {"frame": torch.tensor([frame]), "person": torch.tensor([UNTRACKED])}
+    values["verts"] = verts[None]
     if given is not None:
         values["K"] = v.tensor(given.value).reshape(1, 3, 3)
     return Found("mhr", values)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mover.core.errors import InputError
+from mover.core.files import reason
 from mover.core.pickles import load_plain
 from mover.core.records import BROKEN
 from mover.io.files.fields import (
@@ -23,15 +24,19 @@ from mover.io.files.fields import (
     get,
     mapping,
     read_json,
-    reason,
     refuse,
 )
-from mover.io.files.npz import read_npz
+from mover.io.files.npz import AMASS, is_amass, read_npz
 
 PICKLES = (".pkl", ".pickle", ".joblib", ".pt", ".pth")
 KINDS = (".npz", ".npy", *PICKLES, ".json")
 SHOWN_KEYS = 24
 LEAST_TURN = 0.05  # an array of matrices whose rows are not unit vectors within this is none
+
+
+def named(path: Path) -> Path:
+    """A path that has a name for messages, as `.` has not."""
+    return path if path.name not in ("", "..") else path.resolve()
 
 
 def existing(path: Path) -> Path:
@@ -61,7 +66,7 @@ def read_any(path: Path) -> At:
     except ValueError:  # a pickled object
         return At(load_plain(path), path.name)
     except BROKEN as error:
-        raise InputError(f"{path.name}: cannot be read ({reason(error)})") from error
+        raise InputError(f"{path.name}: cannot be read ({reason(error, path)})") from error
 
 
 def files_of(path: Path, pattern: str, what: str) -> list[Path]:
@@ -129,6 +134,8 @@ def need(at: At, *names: str) -> At:
         keys = [f"'{key}'" for key in mapping(at)]
         more = f" and {len(keys) - SHOWN_KEYS} more" if len(keys) > SHOWN_KEYS else ""
         known = (", ".join(keys[:SHOWN_KEYS]) or "none") + more
+        if is_amass(at):
+            known += f"; this is {AMASS}"
         raise InputError(f"{place}there is no key {wanted}, found {known}")
     return found
 
