@@ -82,9 +82,14 @@ def test_polygons_are_joined_and_clipped() -> None:
         ([[0, 0, 1, 1, 2, 2, 3]], "7 items"),
         ([[0, 0, 1, float("nan"), 2, 2]], "far outside"),
         ([[0, 0, 1, 1e300, 2, 2]], "far outside"),
-        ([[0, 0, 1, "a", 2, 2]], "6 items"),
+        ([[0, 0, 1, "a", 2, 2]], r"polygon 0 with text \('a'\), expected .* without quotes"),
+        ([["0.5", "0", "1", "1", "2", "2"]], r"text \('0.5'\)"),
         ([3], "3"),
-        ("abc", "str"),
+        ([[]], "no polygon"),
+        ("abc", "compressed code"),
+        ("{'size': [3, 5], 'counts': [14]}", "sum to 14"),
+        ("[[[[", "compressed code"),
+        ({"size": [3, 5], "counts": "b'ä'"}, "compressed code"),
         (7, "int"),
         ({"counts": [15]}, "has size None"),
         ({"size": [5, 3], "counts": [15]}, r"has size \[5, 3\], expected \[3, 5\]"),
@@ -107,6 +112,25 @@ def test_a_malformed_mask_is_told_with_its_place(segmentation: object, words: st
         from_coco(segmentation, 3, 5, WHERE)
     assert str(caught.value).startswith(WHERE)
     assert "expected" in str(caught.value)
+
+
+WAYS = {
+    "str() of bytes": lambda code: {"size": [6, 9], "counts": str(code.encode())},
+    "str() of the whole": lambda code: str({"size": [6, 9], "counts": code}),
+    "the code alone": lambda code: code,
+    "bytes": lambda code: {"size": [6, 9], "counts": code.encode()},
+    "one polygon": lambda _: [2, 1, 7, 1, 7, 4, 2, 4],
+    "pairs": lambda _: [[2, 1], [7, 1], [7, 4], [2, 4]],
+    "an empty polygon beside": lambda _: [[], [2, 1, 7, 1, 7, 4, 2, 4]],
+}  # cocoapi 493, 531, 70; cvat 4750, 814; rectlabel 219
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_mask_is_read_as_people_write_it(way: str) -> None:
+    expected = np.zeros((6, 9), dtype=bool)
+    expected[1:4, 2:7] = True
+    written = WAYS[way](compressed(runs(expected)))
+    assert (image_of(from_coco(written, 6, 9, WHERE), (6, 9)) == expected).all()
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the shared data is not here")

@@ -21,6 +21,7 @@ from mover.core.errors import InputError
 from mover.geometry.rotations import affine
 from mover.io.capture.parts import Hints, Parts
 from mover.io.files.fields import At, choice, get, items, maybe, read_json, refuse, vector
+from mover.io.files.looks import load_parts
 from mover.io.files.meshes import load_arrays, mesh_of, read_mesh, write_mesh
 from mover.io.files.schema import rotation
 from mover.io.masks.coco import annotations_tree
@@ -30,7 +31,6 @@ from mover.io.scenes.placing import (
     Pieces,
     Placed,
     about_y,
-    load_parts,
     write_parts,
 )
 from mover.io.scenes.total3d import CLASSES, FURNITURE
@@ -113,6 +113,10 @@ def without_axes(path: Path, world: Matrix, file: Path) -> Placed:
     local = verts @ about_y(yaw)  # rows: R_y(-yaw) v
     low, high = local.min(0), local.max(0)
     origin = np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
-    found = write_parts(load_parts(path), affine(about_y(-yaw), -origin) @ world, file)
+    found = write_parts(
+        load_parts(At(path.name, path.parent.name), path),
+        affine(about_y(-yaw), -origin) @ world,
+        file,
+    )
     fields = {"translation": (about_y(yaw) @ origin).tolist(), "yaw": yaw, "scale": [1.0] * 3}
     return fields, found, ""

@@ -18,8 +18,8 @@ from mover.core.errors import InputError
 from mover.core.types import Keypoints, Masks
 from mover.geometry.rle import decode, encode
 from mover.io.formats import names
-from mover.io.masks.instance_files import read_instances
-from mover.io.masks.instances import Instance, Instances, fitted, followed, is_person, objects_tree
+from mover.io.masks.instance_files import read_people, read_things
+from mover.io.masks.instances import Instance, Instances, objects_tree
 from mover.io.people.found import Known
 from mover.io.people.keypoints import keypoints_from, read_keypoints
 from mover.perceive.networks import Tracks
@@ -90,10 +90,10 @@ def own_masks(path: Path, clip: Clip, drift: Drift, say: Callable[[str], None]) 
         InputError: If the file cannot be read, has another size, or none of these frames.
     """
     size = clip.width, clip.height
-    found = fitted(read_instances(path, {}, size), size)
-    items = [item for item in followed(found.items) if item.mask is not None]
-    if any(is_person(item) for item in items):
-        items = [item for item in items if is_person(item)]
+    found = read_people(path, {}, size)
+    for note in found.notes:
+        say(f"note: {note}")
+    items = [item for item in found.items if item.mask is not None]
     frames = torch.tensor([item.frame for item in items], dtype=torch.long)
     rows, at = _taken(frames, clip.in_source, path, say)
     codes, kept = list[bytes](), list[int]()
@@ -115,8 +115,8 @@ def own_objects(own: Own, clip: Clip, drift: Drift) -> dict[str, Any]:
     """
     assert own.objects is not None
     size = clip.width, clip.height
-    found = fitted(read_instances(own.objects, {}, size), size)
-    items = [item for item in found.items if not is_person(item)]
+    found = read_things(own.objects, {}, size, "reference.png")
+    items = list(found.items)
     if not items:
         raise InputError(f"{own.objects.name}: has no furniture, expected outlines or boxes")
     if own.objects_frame is not None:

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from mover.io.capture.merge import Imported
     from mover.io.capture.parts import Hints, Parts
     from mover.io.files.fields import At
-    from mover.io.masks.instances import Instances
 
 
 FORMATS = f"How the source is written; see docs/your-own-data.md.\n{listing(*IMPORTED)}"
@@ -193,40 +192,28 @@ def _bodies_of_tool(args: ImportArgs, parts: "Sequence[Parts]", hints: "Hints") 
 
 def _masks(args: ImportArgs, parts: "Sequence[Parts]", hints: "Hints") -> "list[Parts]":
     """Masks of the options, in an image of the camera's size; people too where none has a name."""
-    from mover.io.capture.parts import UNKNOWN, Parts
+    from mover.io.capture.parts import Parts
     from mover.io.files.images import image_size
-    from mover.io.masks.instance_files import read_instances
-    from mover.io.masks.instances import (
-        fitted,
-        is_person,
-        objects_tree,
-        people_tree,
-        with_reference_people,
-    )
+    from mover.io.masks.instance_files import read_people, read_things
+    from mover.io.masks.instances import objects_tree, people_tree, with_reference_people
 
     camera = next((p.camera for p in reversed(parts) if p.camera is not None), hints.camera)
     size = None if camera is None else (camera.value.get("w"), camera.value.get("h"))
     shape = None if hints.image is None else image_size(hints.image)
-
-    def masks_at(path: Path, only_people: bool) -> "Instances":
-        masks = fitted(read_instances(path, hints.names, shape), size)
-        if not only_people:
-            return masks
-        kept = tuple(i for i in masks.items if is_person(i) or i.category == UNKNOWN)
-        return dataclasses.replace(masks, items=kept)
-
     found: list[Parts] = []
     if args.objects_masks is not None:
-        masks = masks_at(args.objects_masks, only_people=False)
-        things = [item for item in masks.items if not is_person(item)]
-        found.append(Parts(name="", objects=objects_tree(masks, things)))
+        picture = "" if args.image is None else args.image.name
+        masks = read_things(args.objects_masks, hints.names, shape, picture, fit=size)
+        tree = objects_tree(masks, masks.items)
+        found.append(Parts(name="", objects=tree, notes=masks.notes))
     if args.people_masks is not None:
-        masks = masks_at(args.people_masks, only_people=True)
-        found.append(Parts(name="", people=people_tree(masks, args.fps)))
+        masks = read_people(args.people_masks, hints.names, shape, size)
+        found.append(Parts(name="", people=people_tree(masks, args.fps), notes=masks.notes))
     if args.reference_people is not None:
-        masks = masks_at(args.reference_people, only_people=True)
+        masks = read_things(args.reference_people, hints.names, shape, fit=size, people=True)
         people = next((p.people for p in reversed([*parts, *found]) if p.people is not None), None)
-        found.append(Parts(name="", people=with_reference_people(people, masks, args.out)))
+        tree = with_reference_people(people, masks, args.out)
+        found.append(Parts(name="", people=tree, notes=masks.notes))
     return found
 
 

@@ -37,7 +37,7 @@ class AnnotationFields(Struct, frozen=True):
 
 def detections_of(at: At, camera: Camera, warn: Warn) -> tuple[Detection, ...]:
     """The instances of objects.json."""
-    image = check_image(items(get(at, "images"), 1)[0], camera)
+    image = check_image(_only_image(at), camera)
     names = categories_of(get(at, "categories"))
     known, found = set[object](), list[Detection]()
     for item in items(get(at, "annotations")):
@@ -60,7 +60,20 @@ def detections_of(at: At, camera: Camera, warn: Warn) -> tuple[Detection, ...]:
 
 def image_name(at: At) -> At | None:
     """The field that names the reference image, None if it is not given."""
-    return maybe(items(get(at, "images"), 1)[0], "file_name")
+    return maybe(_only_image(at), "file_name")
+
+
+def _only_image(at: At) -> At:
+    """The one image of objects.json."""
+    images = items(get(at, "images"))
+    if len(images) > 1:
+        named = [shown(get(image, "file_name").value) for image in images[:3]]
+        how = (
+            "`mover import masks FILE --image PICTURE --out FOLDER` takes that of a picture's name"
+        )
+        found = f"{len(images)} images ({', '.join(named)}, ...)"
+        refuse(get(at, "images"), f"a list of 1; {how}", found)
+    return items(get(at, "images"), 1)[0]
 
 
 def _box_of(at: At, box: Box, camera: Camera, warn: Warn) -> Float[Tensor, "4"]:

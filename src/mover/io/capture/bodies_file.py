@@ -28,7 +28,7 @@ from mover.io.files.fields import (
     number,
     refuse,
 )
-from mover.io.files.meshes import check_faces
+from mover.io.files.looks import check_faces
 from mover.io.files.npz import AMASS, is_amass, read_npy, read_npz, write_npz
 from mover.io.formats import names
 from mover.io.people.values import named

@@ -24,7 +24,7 @@ from mover.io.export.finished import (
     visible_spans,
 )
 from mover.io.export.posed import Skinned, all_angles, bones_for, rest_of
-from mover.io.export.scene_glb import linear, placement_of, write_glb
+from mover.io.export.scene_glb import linear, losses_of, placement_of, write_glb
 
 TOLERANCE = 0.005  # [m], of the straight lines between two shapes
 MOST = 60  # shapes of one person
@@ -52,7 +52,7 @@ def export_glb(finished: Finished, folder: Path, body: BodyForm = "auto") -> Exp
     moved = [item for item in scene.objects if item.segments]
     skin = bones_for(finished, body, INFLUENCES)
     first, fps = clock_of(finished.bodies)
-    notes = list[str]()
+    notes = losses_of(scene)
     if bodies is not None or moved:
         notes.append(f"frame {first} of the video is at 0 s, each next one {1 / fps:g} s later")
     for item in moved:

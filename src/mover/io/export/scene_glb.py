@@ -16,6 +16,8 @@ from mover.geometry.camera import NEAR
 from mover.geometry.placement import place_object
 from mover.geometry.rotations import affine, rot_y
 from mover.io.export.finished import Exported, Finished
+from mover.io.files.fields import At
+from mover.io.files.looks import load_parts, looks_lost
 from mover.io.files.meshes import stretched_part
 
 GHOSTS = 12  # at most so many bodies
@@ -101,7 +103,8 @@ def parts_of(item: SceneObject, tint: Colour) -> list[tuple[Any, np.ndarray]]:
     import trimesh
 
     file, found = Path(item.mesh_file), list[tuple[Any, np.ndarray]]()
-    loaded = trimesh.load_scene(file) if item.mesh_file and file.is_file() else trimesh.Scene()
+    known = bool(item.mesh_file) and file.is_file()
+    loaded = load_parts(At(file.name, item.id), file, process=True) if known else trimesh.Scene()
     for node in loaded.graph.nodes_geometry:
         transform, name = loaded.graph[node]
         part = loaded.geometry[name]
@@ -110,6 +113,12 @@ def parts_of(item: SceneObject, tint: Colour) -> list[tuple[Any, np.ndarray]]:
         if isinstance(part, trimesh.Trimesh) and len(part.faces):
             found.append((_coloured(part, tint, item.id), np.asarray(transform)))
     return found or [(_solid(item.mesh, (*tint, 1.0), item.id), np.eye(4))]
+
+
+def losses_of(scene: Scene) -> list[str]:
+    """What to say of textures and materials that are lost, one object a line."""
+    files = (Path(item.mesh_file) for item in scene.objects if item.mesh_file)
+    return [lost for file in files if file.is_file() and (lost := looks_lost(file))]
 
 
 def _coloured(part: Any, tint: Colour, name: str) -> Any:  # noqa: ANN401

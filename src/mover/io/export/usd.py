@@ -29,7 +29,14 @@ from mover.io.export.finished import (
     tracks_of,
     visible_spans,
 )
-from mover.io.export.scene_glb import FLOOR_COLOUR, floor_of, linear, parts_of, view_matrix
+from mover.io.export.scene_glb import (
+    FLOOR_COLOUR,
+    floor_of,
+    linear,
+    losses_of,
+    parts_of,
+    view_matrix,
+)
 from mover.io.export.solids import AXES, FRICTION, Solid, floor_height, solids_of
 
 GRAVITY = 9.81  # [m/s²]
@@ -86,7 +93,8 @@ def export_usd(finished: Finished, folder: Path, body: BodyForm = "auto", up: Up
             _add_person(stage, bodies, track)
         stage.GetRootLayer().Save()
     moving = "people's meshes move in straight lines between samples, 2 mm off"
-    return Exported((path,), ("no people" if bodies is None else moving,))
+    notes = ("no people" if bodies is None else moving, *losses_of(finished.scene))
+    return Exported((path,), notes)
 
 
 def _head(stage: Stage, finished: Finished, up: Up) -> None:

@@ -1,23 +1,18 @@
 """Mesh files: read any, copy them with what belongs to them, write new ones."""
 
-import json
-import re
-import warnings
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mover.core.errors import InputError
 from mover.core.files import copy_whole, replacing
 from mover.core.types import Mesh, SeatStretch
 from mover.io.files.fields import LARGEST, LARGEST_FILE, At, reason, refuse, shown, text
+from mover.io.files.looks import check_faces, companions, load_parts
 
 KINDS = (".glb", ".gltf", ".obj", ".ply", ".off", ".stl")
-MOST_NUMBERS = 1 << 27  # in one array of a glTF file
 THINNEST = 1e-9  # a mesh that is thinner along two axes has no surface
 
 
@@ -55,56 +50,8 @@ def read_mesh(at: At, folder: Path) -> tuple[Mesh, str]:
 
 def load_arrays(at: At, path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
     """All vertices, used or not, and the faces of all parts of a file."""
-    import trimesh
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of parsers about things that are checked here
-        try:
-            check_gltf(at, path)
-            scene = trimesh.load_scene(str(path), process=False, skip_materials=True)
-            for part in scene.geometry.values():
-                check_faces(at, np.asarray(part.faces), len(part.vertices))
-            whole = scene.to_mesh()
-            return np.asarray(whole.vertices), np.asarray(whole.faces)
-        except InputError:
-            raise
-        except Exception as error:  # the parsers of six formats raise anything on broken files
-            found = f"{at.value!r}, which cannot be read ({reason(error)})"
-            refuse(at, "a readable mesh", found)
-
-
-def check_gltf(at: At, path: Path, *, pictures: bool = False) -> None:
-    """Refuse buffers outside of the file's folder, and more numbers than a file can hold.
-
-    Other kinds than glTF pass; with `pictures` those outside of the folder are refused as well.
-    """
-    if path.suffix.lower() not in (".glb", ".gltf"):
-        return
-    tree = gltf_tree(path)
-    for kind in ("buffers", "images") if pictures else ("buffers",):
-        for part in tree.get(kind, []):
-            uri = part.get("uri", "data:")
-            if not uri.startswith("data:") and not _is_companion(path, unquote(uri)):
-                refuse(at, f"{kind} beside it", f"{at.value!r} with the file {shown(uri)}")
-    for part in tree.get("accessors", []):
-        if part["count"] > MOST_NUMBERS:
-            refuse(at, f"at most {MOST_NUMBERS} items", f"{at.value!r} with {part['count']}")
-
-
-def gltf_tree(path: Path) -> Any:  # noqa: ANN401
-    """The JSON of a .gltf or .glb; what it holds is not checked."""
-    content = path.read_bytes()
-    if path.suffix.lower() == ".glb":
-        start, size = 20, int.from_bytes(content[12:16], "little")
-        content = content[start : start + size]
-    return json.loads(content)
-
-
-def check_faces(at: At, faces: NDArray[Any], count: int) -> None:
-    """Refuse faces that name vertices which do not exist."""
-    if faces.size and (faces.min() < 0 or faces.max() >= count):
-        found = f"faces that name vertices {faces.min()} to {faces.max()}"
-        refuse(at, f"vertices 0 to {count - 1}", found)
+    whole = load_parts(at, path, looks=False).to_mesh()
+    return np.asarray(whole.vertices), np.asarray(whole.faces)
 
 
 def mesh_of(verts: NDArray[Any], faces: NDArray[Any], at: At) -> Mesh:
@@ -160,10 +107,7 @@ def stretch_file(path: Path, stretch: SeatStretch) -> Path:
     import trimesh
     from trimesh.exchange.gltf import export_glb
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of parsers, as in `load_arrays`
-        whole = trimesh.load_scene(str(path), process=False)
-    out = trimesh.Scene()
+    whole, out = load_parts(At(path.name, path.name), path), trimesh.Scene()
     for node in whole.graph.nodes_geometry:
         matrix, name = whole.graph[node]
         out.add_geometry(stretched_part(whole.geometry[name], matrix, stretch), node_name=node)
@@ -182,35 +126,3 @@ def stretched_part(part: Any, matrix: NDArray[Any], stretch: SeatStretch) -> Any
     verts = torch.from_numpy(np.array(part.vertices, dtype=np.float32))
     part.vertices = stretch.of(verts).numpy()
     return part
-
-
-def companions(path: Path) -> tuple[Path, ...]:
-    """Files that an .obj or .gltf names (materials, textures, buffers), relative to its folder."""
-    match path.suffix.lower():
-        case ".obj":
-            names = _named_in(path, r"^mtllib\s+(.+?)\s*$")
-            for library in [n for n in names if _is_companion(path, n)]:
-                options = r"^\s*(?:map_\w+|bump|disp|decal|refl|norm)\s+(?:-.*\s)?(.+?)\s*$"
-                home = Path(library).parent
-                names += [str(home / n) for n in _named_in(path.parent / library, options)]
-        case ".gltf":
-            tree = json.loads(path.read_text(encoding="utf-8"))
-            parts = [*tree.get("buffers", []), *tree.get("images", [])]
-            names = [unquote(part["uri"]) for part in parts if "uri" in part]
-        case _:
-            names = []
-    return tuple(Path(n) for n in dict.fromkeys(names) if _is_companion(path, n))
-
-
-def _named_in(path: Path, pattern: str) -> list[str]:
-    """The first group of each match of a pattern in a text file."""
-    found = re.findall(pattern, path.read_text(encoding="utf-8", errors="replace"), re.MULTILINE)
-    return [str(name).replace("\\", "/") for name in found]
-
-
-def _is_companion(path: Path, name: str) -> bool:
-    """Whether a name is that of a file at or below the folder of `path`."""
-    if name.startswith("data:") or "\0" in name:
-        return False
-    full = (path.parent / name).resolve()
-    return full.is_file() and full.is_relative_to(path.parent.resolve())

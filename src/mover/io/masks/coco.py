@@ -1,6 +1,9 @@
 """COCO: images, categories, masks as polygons or run-length codes."""
 
+import ast
+import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -34,8 +37,10 @@ def from_coco(segmentation: Any, height: int, width: int, where: str) -> bytes: 
     Raises:
         InputError: If it is malformed or does not fit the image. It may be empty.
     """
+    if isinstance(segmentation, str):
+        segmentation = _of_text(segmentation, height, width)
     if isinstance(segmentation, list | tuple):
-        return _from_polygons(segmentation, height, width, where)
+        return _from_polygons(_nested(segmentation), height, width, where)
     if not isinstance(segmentation, dict):
         kinds = "polygons [[x, y, ...], ...] or a run-length code {size, counts}"
         raise InputError(f"{where} has {type(segmentation).__name__}, expected {kinds}")
@@ -57,6 +62,31 @@ def from_coco(segmentation: Any, height: int, width: int, where: str) -> bytes: 
     return coco.frPyObjects(code, height, width)["counts"]  # pyright: ignore
 
 
+def _of_text(written: str, height: int, width: int) -> Any:  # noqa: ANN401
+    """What Python printed of polygons or of a code; a code by itself belongs to this image."""
+    if written.strip()[:1] in ("{", "["):
+        with suppress(ValueError, SyntaxError, MemoryError, RecursionError):
+            return ast.literal_eval(written.strip())
+    return {"size": [height, width], "counts": written}
+
+
+def _nested(polygons: Sequence[Any]) -> Sequence[Any]:
+    """Polygons, where a single one may be written as x, y, ... or as pairs (x, y)."""
+    if polygons and all(type(v) in (int, float) for v in polygons):
+        return [polygons]
+    pairs = [p for p in polygons if isinstance(p, list | tuple) and len(p) == 2]
+    if len(pairs) == len(polygons) >= CORNERS:
+        return [[v for pair in pairs for v in pair]]
+    return [p for p in polygons if p not in ([], ())]
+
+
+def is_drawn(segmentation: Any) -> bool:  # noqa: ANN401
+    """Whether there is a mask: tools write [], [[]] or null beside boxes."""
+    if isinstance(segmentation, list | tuple):
+        return any(part not in ([], (), None) for part in segmentation)
+    return segmentation is not None
+
+
 def _runs(counts: Any, where: str) -> NDArray[np.int64]:  # noqa: ANN401
     """The runs of a code of either kind."""
     if isinstance(counts, list | tuple):
@@ -66,6 +96,9 @@ def _runs(counts: Any, where: str) -> NDArray[np.int64]:  # noqa: ANN401
     if not isinstance(counts, str | bytes):
         kinds = "a list of runs or a compressed code"
         raise InputError(f"{where} has {type(counts).__name__} as counts, expected {kinds}")
+    if isinstance(counts, str) and re.fullmatch(r"b'.*'|b\".*\"", counts):
+        with suppress(ValueError, SyntaxError):  # str() of bytes
+            counts = ast.literal_eval(counts)
     try:
         return run_lengths(counts if isinstance(counts, bytes) else counts.encode("ascii"))
     except ValueError as error:
@@ -89,6 +122,10 @@ def _from_polygons(polygons: Sequence[Any], height: int, width: int, where: str)
 
 def _check_polygon(polygon: Any, height: int, width: int, where: str) -> None:  # noqa: ANN401
     """Refuse what the rasteriser would crash on or draw as nonsense."""
+    words = [v for v in polygon if isinstance(v, str)] if isinstance(polygon, list | tuple) else []
+    if words:
+        found = f"text ({words[0][:40]!r})"
+        raise InputError(f"{where} {found}, expected numbers x, y without quotes")
     real = isinstance(polygon, list | tuple) and all(type(v) in (int, float) for v in polygon)
     if not real or len(polygon) < 2 * CORNERS or len(polygon) % 2:
         found = f"{len(polygon)} items" if isinstance(polygon, list | tuple) else str(polygon)[:40]
@@ -133,12 +170,12 @@ def category_of(at: At, names: dict[int, str]) -> str:
 def mask_of(at: At, camera: Camera, warn: Warn) -> Masks | None:
     """The mask of an annotation, None without segmentation."""
     given = maybe(at, "segmentation")
-    if given is None:
+    if given is None or not is_drawn(given.value):
         return None
     size, polygons = (camera.height, camera.width), isinstance(given.value, list)
     code = from_coco(given.value, *size, given.place)
     for k, side in ((0, camera.width), (1, camera.height)) if polygons else ():
-        ends = [v for polygon in given.value for v in polygon[k::2]]
+        ends = [v for polygon in _nested(given.value) for v in polygon[k::2]]
         if min(ends) < -1 or max(ends) > side + 1:  # by more than a pixel
             warn(f"{given.place} leaves the image and was clipped")
             break

@@ -1,20 +1,17 @@
-"""Files of masks: COCO, lists of detections and labelme (JSON), pictures, arrays."""
+"""Files of masks: COCO, lists of detections, labelme and others (JSON); pixels: label_images.py."""
 
-import re
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from msgspec import Struct, field
-from numpy.typing import NDArray
 
 from mover.core.errors import InputError
 from mover.io.capture.parts import UNKNOWN, Hints, Parts
 from mover.io.files.fields import (
     LAST_INDEX,
     At,
-    array,
     choice,
     get,
     items,
@@ -26,20 +23,32 @@ from mover.io.files.fields import (
     text,
     vector,
 )
-from mover.io.files.images import image_size, opened
-from mover.io.files.npz import read_npy, read_npz
+from mover.io.files.images import image_size
 from mover.io.files.schema import Id, Index, Share, Side, Text, checked
-from mover.io.masks.coco import CategoryFields
+from mover.io.masks.coco import CategoryFields, is_drawn
 from mover.io.masks.instances import (
     Instance,
     Instances,
+    Size,
     checked_code,
-    code_of,
     fitted,
-    is_person,
+    followed,
+    frames_of,
     mask_code,
     objects_tree,
+    people_in,
+    things_in,
 )
+from mover.io.masks.label_images import (
+    PICTURES,
+    Names,
+    pictures_in,
+    read_label_folders,
+    read_label_images,
+    read_mask_arrays,
+    read_mask_dump,
+)
+from mover.io.people.values import PICKLES, natural, number_in
 
 COCO_CLASSES = (
     "person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat",
@@ -58,63 +67,166 @@ GAPS = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)
 """Ids that COCO leaves out."""
 COCO_IDS = tuple(n for n in range(1, 91) if n not in GAPS)
 """COCO's own ids of its classes."""
-MASKS = ("masks", "pred_masks", "mask", "segmentation", "arr_0")
-TRACKS = ("object_ids", "obj_ids", "track_ids", "track", "person", "ids")
-CLASSES = ("labels", "classes", "category", "class_names")
-LABELS = "labels.json"
-NOT_MASKS = frozenset({"image", "rgb", "input", "reference", "depth"})
-"""Names of pictures that lie beside masks."""
-MOST_LABELS = 256
-Size = tuple[int, int]
-"""Width and height of an image [px]."""
-Names = Mapping[str, str]
-"""Categories where the source has none: by number, file name or index."""
+LEAST_SCORE = 0.3  # of MMDetection, which writes everything that it thought of
+EXPORTS = {
+    "Label Studio's JSON": "COCO (polygons) or 'Brush labels to PNG'",
+    "CVAT's XML": "'COCO 1.0' or 'Segmentation mask 1.1'",
+    "an XML of Pascal VOC": "COCO, which has masks",
+    "YOLO's text": "COCO: it has no names and no size of the image",
+    "a project of VIA": "COCO (Annotation, Export)",
+    "an archive": "the files in it: unpack it",
+}
+"""What is not read, and what to export in its place."""
 
 
 def mask_parts(source: Path, hints: Hints) -> Parts:
     """The objects of a file of masks."""
     size = None if hints.image is None else image_size(hints.image)
-    found = fitted(read_instances(source, hints.names, size), size)
-    things = [item for item in found.items if not is_person(item)]
-    return Parts(name=source.stem, objects=objects_tree(found, things))
+    camera = None if hints.camera is None else hints.camera.value
+    if size is None and camera is not None and camera.get("w") and camera.get("h"):
+        size = camera["w"], camera["h"]
+    picture = "" if hints.image is None else hints.image.name
+    found = read_things(source, hints.names, size, picture)
+    tree = objects_tree(found, found.items)
+    return Parts(name=source.stem, objects=tree, notes=found.notes)
 
 
-def read_instances(path: Path, names: Names, size: Size | None) -> Instances:
+def read_things(
+    path: Path,
+    names: Names,
+    size: Size | None,
+    picture: str = "",
+    *,
+    fit: Size | None = None,
+    people: bool = False,
+) -> Instances:
+    """What is seen in one picture, furniture or people, at the size `fit`.
+
+    Of several pictures that of the name or with the number of `picture` counts.
+    """
+    found = read_instances(path, names, size, picture=picture)
+    frames = sorted({item.frame for item in found.items})
+    if len(frames) > 1:
+        wanted = number_in(Path(picture).stem, -1)
+        if wanted not in frames:
+            few = ", ".join(map(str, frames[:4]))
+            raise InputError(
+                f"{path.name}: has things in {len(frames)} images ({few} ...), expected those of "
+                f"{picture or 'the reference picture: give --image'}"
+            )
+        kept = tuple(item for item in found.items if item.frame == wanted)
+        said = f"{path.name}: of {len(frames)} images that with the number of {picture} is taken"
+        found = dataclasses.replace(found, items=kept, notes=(*found.notes, said))
+    else:  # which frame it is does not matter
+        found = dataclasses.replace(found, notes=tuple(n for n in found.notes if "frame" not in n))
+    found = fitted(found, fit or size)
+    if people:
+        return people_in(found)
+    return dataclasses.replace(found, items=tuple(things_in(found)))
+
+
+def read_people(path: Path, names: Names, size: Size | None, fit: Size | None = None) -> Instances:
+    """The people in the frames of a video, each in a track, in images of the size `fit`."""
+    found = fitted(read_instances(path, names, size, people=True), fit or size)
+    return followed(people_in(found))
+
+
+def read_instances(
+    path: Path, names: Names, size: Size | None, *, people: bool = False, picture: str | None = None
+) -> Instances:
     """The instances of any known file or folder of masks.
 
     Args:
-        path: A .json, .npz, .npy or .png file, or a folder.
+        path: A .json, .npz, .npy, .pkl or picture, or a folder.
         names: Categories where the source has none.
         size: Width and height of the image, for sources without it [px].
+        people: Whether people in frames are looked for.
+        picture: The file name of the only picture that counts; None: all do.
     """
     if path.is_dir():
-        pictures = sorted(p for p in path.iterdir() if p.suffix.lower() == ".png")
-        if not pictures:
-            raise InputError(f"{path}: has no masks, expected pictures (.png)")
-        return read_mask_pictures(pictures, path, names, size)
-    match path.suffix.lower():
-        case ".json":
-            return _of_json(read_json(path), names, size)
-        case ".npz" | ".npy":
-            return read_mask_arrays(path, names)
-        case ".png":
-            return read_mask_pictures([path], path, names, size)
-        case _:
-            kinds = ".json, .npz, .npy, .png or a folder of pictures"
-            raise InputError(f"{path}: is no file of masks, expected {kinds}")
+        return _of_folder(path, names, size, people=people, picture=picture)
+    kind = path.suffix.lower()
+    if kind in (".npz", ".npy"):
+        return read_mask_arrays(path, names, people=people)
+    if kind in PICKLES:
+        return read_mask_dump(path, names, people=people)
+    if kind in PICTURES:
+        return read_label_images([path], path, names, people=people)
+    if kind != ".json":
+        _refuse_export(path, kind)
+    return _of_json(read_json(path), names, size, picture)
 
 
-def _of_json(at: At, names: Names, size: Size | None) -> Instances:
+def _of_folder(
+    path: Path, names: Names, size: Size | None, *, people: bool, picture: str | None
+) -> Instances:
+    """A folder of pictures, of arrays, of folders of those, or of JSON files."""
+    if (path / "mask_data").is_dir():
+        path = path / "mask_data"
+    if found := pictures_in(path):
+        return read_label_images(found, path, names, people=people)
+    if any(pictures_in(home) for home in path.iterdir() if home.is_dir()):
+        return read_label_folders(path, names)
+    files = sorted(path.glob("*.json"), key=natural)
+    if not files:
+        raise InputError(f"{path}: has no masks, expected pictures (.png), .npy or .json files")
+    parts = [_of_json(read_json(file), names, size, picture) for file in files]
+    numbers = [number_in(file.stem, rank) for rank, file in enumerate(files)]
+    frames, notes = frames_of(numbers, f"{path.name}: numbers")
+    sizes = {part.size for part in parts if part.size is not None}
+    if len(sizes) > 1:
+        raise InputError(f"{path.name}: has images of {len(sizes)} sizes, expected one")
+    rows = tuple(
+        dataclasses.replace(item, frame=frames[number])
+        for part, number in zip(parts, numbers, strict=True) for item in part.items
+    )  # fmt: skip
+    notes += tuple(dict.fromkeys(note for part in parts for note in part.notes))
+    looked = frozenset(frames.values())
+    return Instances(rows, next(iter(sizes), size), path.name, looked, notes)
+
+
+def _refuse_export(path: Path, kind: str) -> None:
+    """Name what other programs write, and the export that is read."""
+    head = path.read_bytes()[:2000] if path.is_file() else b""
+    known = {
+        ".xml": "CVAT's XML" if b"<annotations" in head else "an XML of Pascal VOC",
+        ".txt": "YOLO's text", ".zip": "an archive", ".csv": "a project of VIA",
+    }  # fmt: skip
+    if kind in known and head:
+        raise InputError(f"{path}: is {known[kind]}, expected {EXPORTS[known[kind]]}")
+    kinds = ".json, .npz, .npy, .pkl, .png or a folder of pictures"
+    raise InputError(f"{path}: is no file of masks, expected {kinds}")
+
+
+def _of_json(at: At, names: Names, size: Size | None, picture: str | None) -> Instances:
     """JSON, by its keys."""
+    rows = at.value if isinstance(at.value, list) else [at.value]
+    keys = [set(row) if isinstance(row, dict) else set[str]() for row in rows]
+    inner = at.value.values() if isinstance(at.value, dict) else ()
+    told: str | None = None
+    if any({"data", "annotations"} <= one or "completions" in one for one in keys):
+        told = "Label Studio's JSON"
+    elif any("_via_img_metadata" in one for one in keys) or any(
+        isinstance(row, dict) and "regions" in row for row in inner
+    ):
+        told = "a project of VIA"
+    if told:
+        raise InputError(f"{at.file}: is {told}, expected its export as {EXPORTS[told]}")
     if isinstance(at.value, list):
         return list_instances(at, names, size)
-    keys = set(at.value) if isinstance(at.value, dict) else set[str]()
-    if "annotations" in keys:
-        return coco_instances(at, names, size)
-    if "shapes" in keys:
+    (have,) = keys
+    if have & {"box_format", "img_width"}:
+        return _of_grounded_sam(at)
+    if "predictions" in have or {"labels", "scores"} <= have:
+        return _of_mmdet(at, names, size)
+    if "annotations" in have:
+        return coco_instances(at, names, size, picture)
+    if "shapes" in have:
         return labelme_instances(at)
+    if "mask_name" in have:
+        raise InputError(f"{at.file}: has no masks, expected the folder mask_data beside json_data")
     known = "COCO's 'annotations', labelme's 'shapes' or a list of detections"
-    raise InputError(f"{at.file}: has the keys {sorted(keys)[:5]}, expected {known}")
+    raise InputError(f"{at.file}: has the keys {sorted(have)[:5]}, expected {known}")
 
 
 class ImageFields(Struct, frozen=True):
@@ -123,6 +235,7 @@ class ImageFields(Struct, frozen=True):
     id: Id
     width: Side | None = None
     height: Side | None = None
+    file_name: Any = None
 
 
 class RowFields(Struct, frozen=True):
@@ -138,51 +251,103 @@ class RowFields(Struct, frozen=True):
     track_id: Index | None = None
 
 
-def coco_instances(at: At, names: Names, size: Size | None) -> Instances:
-    """The annotations of a COCO file; frames are its images in the order of their ids."""
-    sizes: dict[int, Size] = {}
-    for item in items(get(at, "images")):
-        image = checked(item, ImageFields)
-        own = (image.width, image.height) if image.width and image.height else size
-        if own is None:
-            refuse(item, "width and height, here or by --image")
-        sizes[image.id] = own
-    given = maybe(at, "categories")
+def coco_instances(
+    at: At, names: Names, size: Size | None, picture: str | None = None
+) -> Instances:
+    """The annotations of a COCO file; frames are the numbers in its file names, else its ids.
+
+    With `picture` only that image counts, and where no name is its, the only one with annotations.
+    """
+    listed = [(item, checked(item, ImageFields)) for item in items(get(at, "images"))]
+    rows = [(item, checked(item, RowFields)) for item in items(get(at, "annotations"))]
+    given, known = maybe(at, "categories"), {image.id for _, image in listed}
     words = dict(zip(COCO_IDS, COCO_CLASSES, strict=True))
     if given is not None:
         words = {row.id: str(row.name) for row in checked(given, list[CategoryFields])}
     words |= {int(key): name for key, name in names.items() if key.isdecimal()}
-    rows = [(item, checked(item, RowFields)) for item in items(get(at, "annotations"))]
-    frames = {key: rank for rank, key in enumerate(sorted(sizes))}
-    if any(row.track_id is not None for _, row in rows) and max(sizes, default=0) <= LAST_INDEX:
-        frames = {key: key for key in sizes}  # where people are tracked ids are frames
-    found: list[Instance] = []
     for item, row in rows:
-        if row.image_id not in sizes:
+        if row.image_id not in known:
             refuse(get(item, "image_id"), "the id of one of the images")
         if row.category_id is not None and row.category_id not in words:
             refuse(get(item, "category_id"), "the id of one of the categories")
-        if row.bbox is None and row.segmentation is None:
+        if row.bbox is None and not is_drawn(row.segmentation):
             refuse(item, "an annotation with bbox or segmentation")
-        found.append(_instance(item, row, sizes[row.image_id], words, frames))
+    notes: tuple[str, ...] = ()
+    if picture is not None and len(listed) > 1:
+        used = {row.image_id for _, row in rows}
+        ours = _ours([image for _, image in listed], used, picture, size, at.file)
+        notes = (f"{at.file}: of {len(listed)} images only {ours.file_name or ours.id} is taken",)
+        listed = [(item, image) for item, image in listed if image.id == ours.id]
+        rows = [(item, row) for item, row in rows if row.image_id == ours.id]
+    sizes: dict[int, Size] = {}
+    for item, image in listed:
+        own = (image.width, image.height) if image.width and image.height else size
+        if own is None:
+            refuse(item, "width and height, here or by --image")
+        sizes[image.id] = own
+    tracked = any(row.track_id is not None for _, row in rows)
+    frames, more = _frames_of_images([image for _, image in listed], at.file, tracked=tracked)
+    found = [_instance(item, row, sizes[row.image_id or 0], words, frames) for item, row in rows]
     if len(set(sizes.values())) > 1:
         refuse(get(at, "images"), "images of one size", f"{len(set(sizes.values()))} sizes")
-    return Instances(tuple(found), next(iter(sizes.values()), size), at.file)
+    looked, own = frozenset(frames.values()), next(iter(sizes.values()), size)
+    return Instances(tuple(found), own, at.file, looked, (*notes, *more))
+
+
+def _ours(
+    images: Sequence[ImageFields], used: set[int | None], picture: str, size: Size | None, file: str
+) -> ImageFields:
+    """The one image of a file that is the reference picture."""
+    stem = Path(picture or "reference.jpg").stem.lower()
+    named = [i for i in images if _stem(i).lower() == stem]
+    full = [i for i in images if i.id in used]
+    fits = [i for i in full if size is None or (i.width, i.height) in (size, (None, None))]
+    for group in (named, full, fits):
+        if len(group) == 1:
+            return group[0]
+    few = ", ".join(str(i.file_name or i.id) for i in images[:4])
+    wanted = picture or "reference.jpg, or the name of --image"
+    raise InputError(f"{file}: has {len(images)} images ({few} ...), expected one called {wanted}")
+
+
+def _stem(image: ImageFields) -> str:
+    """The name of an image's file without folders and ending."""
+    return Path(str(image.file_name or "").replace("\\", "/")).stem
+
+
+def _frames_of_images(
+    images: Sequence[ImageFields], file: str, *, tracked: bool
+) -> tuple[dict[int, int], tuple[str, ...]]:
+    """Frames by the ids of images. In files of this program ids of tracked people are frames."""
+    stems = [_stem(image) for image in images]
+    numbers = {i.id: number_in(s, -1) for i, s in zip(images, stems, strict=True)}
+    plain = {s.rstrip("0123456789") for s in stems}
+    if -1 in numbers.values() or len(set(numbers.values())) < len(images) or len(plain) > 1:
+        if tracked and all(i.id <= LAST_INDEX and not i.file_name for i in images):
+            return {image.id: image.id for image in images}, ()
+        numbers, what = {image.id: image.id for image in images}, "ids of images"
+    else:
+        what = "numbers of images"
+    frames, notes = frames_of(list(numbers.values()), f"{file}: {what}")
+    return {key: frames[value] for key, value in numbers.items()}, notes
 
 
 def list_instances(at: At, names: Names, size: Size | None) -> Instances:
     """A list of detections: COCO's results, or those of MOVER with rows of pixels.
 
     An item has `class` (a name) or `category_id`; `bbox` and `segmentation` or `mask`. COCO's ids
-    have gaps; a file whose ids only make sense counted from 0 is read so.
+    have gaps; a file whose ids only make sense counted from 0 is read so. Frames are image_ids.
     """
     rows = [(item, checked(item, RowFields)) for item in items(at)]
+    for item, row in rows:
+        if row.bbox is None and row.mask is None and not is_drawn(row.segmentation):
+            refuse(item, "a detection with bbox, segmentation or mask")
     keys = {row.category_id for _, row in rows if row.category_id is not None}
     contiguous = not keys <= set(COCO_IDS) and max(keys) < len(COCO_CLASSES)
     table = enumerate(COCO_CLASSES) if contiguous else zip(COCO_IDS, COCO_CLASSES, strict=True)
     words = dict(table) | {int(key): name for key, name in names.items() if key.isdecimal()}
-    images = sorted({row.image_id for _, row in rows if row.image_id is not None})
-    frames = {key: rank for rank, key in enumerate(images)}
+    images = [row.image_id for _, row in rows if row.image_id is not None]
+    frames, notes = frames_of(images, f"{at.file}: image_ids")
     found: list[Instance] = []
     for item, row in rows:
         if isinstance(row.segmentation, dict):
@@ -192,7 +357,7 @@ def list_instances(at: At, names: Names, size: Size | None) -> Instances:
             height, width = mask_code(get(item, "mask"))["size"]
             size = width, height
         found.append(_instance(item, row, size, words, frames))
-    return Instances(tuple(found), size, at.file)
+    return Instances(tuple(found), size, at.file, frozenset(frames.values()), notes)
 
 
 def _instance(
@@ -211,7 +376,7 @@ def _instance(
         given = get(at, "mask")
         code = mask_code(given)
         mask = checked_code(code, (code["size"][1], code["size"][0]), given)
-    elif row.segmentation is not None and row.segmentation != []:
+    elif is_drawn(row.segmentation):
         if size is None:
             refuse(given, "the size of the image beside polygons: give --image")
         mask = checked_code(row.segmentation, size, given)
@@ -224,6 +389,58 @@ def _instance(
         frame=0 if row.image_id is None else frames[row.image_id],
         track=row.track_id,
     )
+
+
+def _of_grounded_sam(at: At) -> Instances:
+    """The results of Grounded-SAM-2's demos of pictures, with DUMP_JSON_RESULTS."""
+    size = checked(get(at, "img_width"), Side), checked(get(at, "img_height"), Side)
+    corners = choice(get(at, "box_format"), ("xyxy", "xywh")) == "xyxy"
+    found: list[Instance] = []
+    for item in items(get(at, "annotations")):
+        name, box, given = get(item, "class_name"), maybe(item, "bbox"), get(item, "segmentation")
+        a, b, c, d = vector(box, 4) if box is not None else (0.0, 0.0, 0.0, 0.0)
+        found.append(Instance(
+            category=text(name) if name.value != "" else UNKNOWN,
+            box=None if box is None else (a, b, c, d) if corners else (a, b, a + c, b + d),
+            mask=checked_code(given.value, size, given) if is_drawn(given.value) else None,
+            score=_score(maybe(item, "score")),
+        ))  # fmt: skip
+    return Instances(tuple(found), size, at.file)
+
+
+def _score(at: At | None) -> float:
+    """A score, also as a list of one; networks' own estimates are a little above 1 at times."""
+    while at is not None and isinstance(at.value, list) and len(at.value) == 1:
+        at = items(at)[0]
+    return 1.0 if at is None else min(number(at, 0, 2), 1.0)
+
+
+def _of_mmdet(at: At, names: Names, size: Size | None) -> Instances:
+    """Predictions of MMDetection's DetInferencer: lists of labels, scores, bboxes and masks."""
+    outer = maybe(at, "predictions")
+    at = at if outer is None else items(outer, 1)[0]
+    labels, boxes, masks = get(at, "labels"), maybe(at, "bboxes"), maybe(at, "masks")
+    scores, found, few = items(get(at, "scores")), list[Instance](), 0
+    keys = checked(labels, list[Id])
+    table = {str(k): name for k, name in enumerate(COCO_CLASSES)} | dict(names)
+    if len({len(keys), len(scores), *(len(items(one)) for one in (boxes, masks) if one)}) > 1:
+        refuse(labels, f"as many as scores, bboxes and masks ({len(scores)})", f"{len(keys)} items")
+    for k, key in enumerate(keys):
+        score = number(scores[k], 0, 1)
+        few += score < LEAST_SCORE
+        if score < LEAST_SCORE:
+            continue
+        if str(key) not in table:
+            refuse(items(labels)[k], f"a class of COCO, 0 to {len(COCO_CLASSES) - 1}, or --names")
+        box = None if boxes is None else tuple(vector(items(boxes)[k], 4))
+        given, mask = None if masks is None else items(masks)[k], None
+        if given is not None:
+            height, width = checked(get(given, "size"), tuple[Side, Side])
+            size = width, height
+            mask = checked_code(mapping(given), size, given)
+        found.append(Instance(table[str(key)], box, mask, score))
+    note = f"{at.file}: {few} of {len(keys)} detections with scores below {LEAST_SCORE} left out"
+    return Instances(tuple(found), size, at.file, notes=(note,) if few else ())
 
 
 class LabelmeFields(Struct, frozen=True, rename="camel"):
@@ -264,125 +481,3 @@ def labelme_instances(at: At) -> Instances:
         for key, polygons in groups.items()
     ]
     return Instances(tuple(found), size, at.file)
-
-
-def read_mask_arrays(path: Path, names: Names) -> Instances:
-    """Masks of an .npz or .npy file.
-
-    `masks` is (n, h, w), (n, 1, h, w) or (frames, objects, h, w), as booleans, bytes or logits
-    (above 0 is inside); or (h, w), a label map. Beside it may stand `scores`, `labels` (names),
-    `object_ids` and `frame`. With a single object id (n, 1, h, w) is one thing in n frames. Boxes
-    are those of the masks.
-    """
-    npz = path.suffix.lower() == ".npz"
-    at = read_npz(path) if npz else At({"masks": read_npy(path).value}, path.name)
-    given = _first(at, MASKS)
-    if given is None:
-        refuse(at, f"an array named {', '.join(MASKS)}", f"the arrays {sorted(at.value)[:6]}")
-    stack = given.value
-    if not isinstance(stack, np.ndarray) or stack.dtype.kind not in "buif" or stack.ndim < 2:
-        refuse(given, "an array of masks (n, h, w), (frames, objects, h, w) or labels (h, w)")
-    if stack.ndim == 2 and stack.dtype != np.bool_:
-        values = [int(v) for v in np.unique(stack[np.isfinite(stack)]).tolist() if v > 0]
-        items = [Instance(names.get(str(v), UNKNOWN), None, code_of(stack == v)) for v in values]
-        return Instances(tuple(items), (stack.shape[1], stack.shape[0]), path.name)
-    if stack.ndim > 4 or not stack.size:
-        refuse(given, "an array of masks (n, h, w) or (frames, objects, h, w)")
-    return _of_stack(at, stack, names)
-
-
-def _of_stack(at: At, stack: NDArray[Any], names: Names) -> Instances:
-    """The masks of a stack: of one image, of frames that an array names, or of all frames."""
-    ids, frame = _first(at, TRACKS), maybe(at, "frame")
-    one_id = ids is not None and isinstance(ids.value, np.ndarray) and ids.value.shape == (1,)
-    height, width = stack.shape[-2:]
-    flat = stack.reshape(-1, height, width)
-    rows, tracks = len(flat), None
-    if stack.ndim == 4 and (stack.shape[1] != 1 or (one_id and frame is None)):
-        count = stack.shape[1]
-        frames = np.repeat(np.arange(len(stack)), count)
-        each = np.arange(count) if ids is None else _counted(ids, count)
-        tracks = np.tile(each, len(stack))
-    else:
-        frames = np.zeros(rows, dtype=np.int64) if frame is None else _counted(frame, rows)
-        tracks = None if ids is None else _counted(ids, rows)
-    words, scores = _first(at, CLASSES), maybe(at, "scores")
-    labels, sure = [UNKNOWN] * rows, np.ones(rows)
-    if words is not None and isinstance(words.value, np.ndarray) and words.value.dtype.kind == "U":
-        labels = [str(word) for word in array(words, (rows,), "text")]
-    if scores is not None and isinstance(scores.value, np.ndarray) and scores.value.size == rows:
-        sure = np.clip(array(scores, scores.value.shape).reshape(-1), 0, 1)
-    found: list[Instance] = []
-    for i, pixels in enumerate(flat):
-        code, track = code_of(pixels > 0), None if tracks is None else int(tracks[i])
-        name = names.get(str(i if track is None else track)) or labels[i]
-        if code is not None:
-            found.append(Instance(name, None, code, float(sure[i]), int(frames[i]), track))
-    return Instances(tuple(found), (width, height), at.file)
-
-
-def _first(at: At, keys: Sequence[str]) -> At | None:
-    """The first of several names of an array that is there."""
-    return next((found for key in keys if (found := maybe(at, key)) is not None), None)
-
-
-def _counted(at: At, rows: int) -> NDArray[np.int64]:
-    """Frames or tracks, one a row."""
-    value = array(at, (rows,), "whole").astype(np.int64)
-    if (value < 0).any() or (value > LAST_INDEX).any():
-        refuse(at, f"whole numbers from 0 to {LAST_INDEX}")
-    return value
-
-
-def read_mask_pictures(
-    paths: Sequence[Path], source: Path, names: Names, size: Size | None
-) -> Instances:
-    """Masks of pictures; a category is looked up in labels.json, `names`, then the file name.
-
-    A picture with an alpha channel that is not full is one mask. One with two values is one mask;
-    one with more is a label map (a pixel is the number of a thing, 0 is nothing). Pictures whose
-    names are numbers of five digits or more, all label maps, are frames of a video.
-    """
-    labels = (source if source.is_dir() else source.parent) / LABELS
-    table = dict(names)
-    if labels.is_file():
-        at = read_json(labels)
-        words = {key: text(At(value, at.file, key)) for key, value in mapping(at).items()}
-        table = words | table
-    paths = [p for p in paths if p.stem.lower() not in NOT_MASKS]
-    video = len(paths) > 1 and all(re.fullmatch(r"[0-9]{5,8}", p.stem) for p in paths)
-    found, sizes = list[Instance](), set[Size]()
-    for path in paths:
-        pixels = read_labels(path)
-        sizes.add((pixels.shape[1], pixels.shape[0]))
-        values = [v for v in np.unique(pixels).tolist() if v != 0]
-        if len(values) > MOST_LABELS:
-            n = f"{len(values)} different values"
-            raise InputError(f"{path.name}: has {n}, expected at most {MOST_LABELS} labels")
-        if len(values) == 1 and not video:
-            parts = re.sub(r"[\d_-]+", " ", path.stem).split()  # `chair` of chair_0, 03_chair
-            plain = " ".join(word for word in parts if word.lower() not in ("mask", "masks"))
-            name = table.get(path.stem) or plain or UNKNOWN
-            found.append(Instance(name, None, code_of(pixels == values[0])))
-            continue
-        for value in values:
-            name, frame = table.get(str(value), UNKNOWN), int(path.stem) if video else 0
-            track = value if video else None
-            found.append(Instance(name, None, code_of(pixels == value), frame=frame, track=track))
-    if len(sizes) > 1:
-        raise InputError(f"{source.name}: has pictures of {len(sizes)} sizes, expected one")
-    return Instances(tuple(found), sizes.pop() if sizes else size, source.name)
-
-
-def read_labels(path: Path) -> NDArray[np.int64]:
-    """The numbers of a picture of labels (h, w): palette or grey values, or alpha above 0."""
-    with opened(path, expected="a picture of masks", bombs="error") as picture:
-        if picture.mode in ("RGBA", "LA", "PA"):
-            alpha = np.asarray(picture.getchannel("A"))
-            if (alpha < 255).any():
-                return (alpha > 0).astype(np.int64)
-            picture = picture.convert("RGB")
-        pixels = np.asarray(picture).astype(np.int64)
-    if pixels.ndim == 3:
-        pixels = pixels[..., 0] + 256 * pixels[..., 1] + 65536 * pixels[..., 2]
-    return pixels

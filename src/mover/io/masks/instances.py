@@ -12,12 +12,20 @@ from numpy.typing import NDArray
 
 from mover.core.errors import InputError
 from mover.core.types import Masks
+from mover.furniture.library import plain_name, unknown_names
 from mover.geometry.rle import area, decode, encode, tight_box
-from mover.io.files.fields import At, read_json, refuse
+from mover.io.capture.parts import UNKNOWN
+from mover.io.files.fields import LAST_INDEX, At, listed, read_json, refuse
 from mover.io.masks.coco import annotations_tree, from_coco, segmentation
+from mover.io.people import found as bodies
 
-PERSON = frozenset({"person", "people", "human", "man", "woman", "child"})
+PERSON = frozenset({
+    "person", "persons", "people", "human", "humans", "man", "men", "woman", "women", "child",
+    "children", "boy", "girl", "adult", "pedestrian", "actor", "player", "human body", "kid",
+})  # fmt: skip
 SAME_SHAPE = 0.02  # masks of another size fit an image whose sides have this ratio, nearly
+Size = tuple[int, int]
+"""Width and height of an image [px]."""
 
 
 @dataclass(frozen=True)
@@ -39,9 +47,13 @@ class Instances:
     """All things that a source found."""
 
     items: tuple[Instance, ...]
-    size: tuple[int, int] | None
+    size: Size | None
     """Width and height of the images [px]; None where the source has none."""
     file: str
+    frames: frozenset[int] = frozenset()
+    """Those that were looked at, with things in them or without."""
+    notes: tuple[str, ...] = ()
+    """What was decided that the source does not say."""
 
 
 def mask_code(at: At) -> dict[str, Any]:
@@ -60,14 +72,37 @@ def code_of(pixels: NDArray[Any]) -> bytes | None:
     return encode(torch.from_numpy(np.ascontiguousarray(pixels))) if pixels.any() else None
 
 
-def checked_code(given: Any, size: tuple[int, int], at: At) -> bytes | None:  # noqa: ANN401
+def checked_code(given: Any, size: Size, at: At) -> bytes | None:  # noqa: ANN401
     """The code of COCO's polygons or run lengths in an image of this size; None where empty."""
     width, height = size
     code = from_coco(given, height, width, at.place)
     return code if area(Masks(height, width, (code,)), 0) else None
 
 
-def fitted(found: Instances, size: tuple[int, int] | None) -> Instances:
+def frames_of(numbers: Sequence[int], what: str) -> tuple[dict[int, int], tuple[str, ...]]:
+    """Frames, counted from 0, by the numbers that a source has for them; gaps stay gaps.
+
+    Numbers whose first is 1 count from 1: a video's frame 0 is seldom the only one without a thing.
+    Such as are too large for frames (ids of a data set) are counted in their order.
+
+    Args:
+        numbers: In any order.
+        what: How messages call them.
+    """
+    known = sorted(set(numbers))
+    if not known or known[0] == 0:
+        return {n: n for n in known}, ()
+    if known[-1] > LAST_INDEX:
+        said = f"{what} up to {known[-1]} are no frames: images are counted in their order"
+        return {n: rank for rank, n in enumerate(known)}, (said,) if len(known) > 1 else ()
+    first = known[0] == 1
+    gaps = known[-1] - known[0] + 1 - len(known)
+    said = f"{what} {known[0]} to {known[-1]}" + (f" with {gaps} left out" if gaps else "")
+    how = "count from 1: 1 is frame 0 of the video" if first else "are frames counted from 0"
+    return {n: n - first for n in known}, (f"{said} {how}",) if len(known) > 1 else ()
+
+
+def fitted(found: Instances, size: Size | None) -> Instances:
     """The instances in an image of this size, resampled where theirs has the same shape."""
     if size is None or found.size is None or found.size == size:
         return found if found.size is not None else dataclasses.replace(found, size=size)
@@ -85,12 +120,35 @@ def fitted(found: Instances, size: tuple[int, int] | None) -> Instances:
         if mask is not None:
             mask = code_of(decode(Masks(h, w, (mask,)), 0).numpy()[rows][:, columns])
         items.append(dataclasses.replace(item, box=box, mask=mask))
-    return Instances(tuple(items), size, found.file)
+    said = f"masks of {w} x {h} pixels are stretched to the image of {width} x {height}"
+    return dataclasses.replace(found, items=tuple(items), size=size, notes=(*found.notes, said))
 
 
 def is_person(item: Instance) -> bool:
     """Whether an instance is a person."""
-    return item.category.lower() in PERSON
+    return item.category.lower() in PERSON or plain_name(item.category) in PERSON
+
+
+def things_in(found: Instances) -> list[Instance]:
+    """All but people."""
+    return [item for item in found.items if not is_person(item)]
+
+
+def people_in(found: Instances) -> Instances:
+    """The people among the instances, and such as have no name.
+
+    Where no name is a person's or a thing's that is known, all are people.
+    """
+    kept = [item for item in found.items if is_person(item) or item.category == UNKNOWN]
+    others = sorted({item.category for item in found.items} - {UNKNOWN})
+    notes = list(found.notes)
+    if not kept and others:
+        kept = [item for item in found.items if unknown_names([item.category])]
+        named = listed("name", [repr(name) for name in others])
+        notes.append(
+            f"{named} taken as people's" if kept else f"{found.file} has no people, only {named}"
+        )
+    return dataclasses.replace(found, items=tuple(kept), notes=tuple(notes))
 
 
 def objects_tree(found: Instances, items: Sequence[Instance]) -> At:
@@ -125,12 +183,12 @@ def people_tree(found: Instances, fps: float | None = None) -> At:
     """
     width, height = _size_of(found, "images")
     rows: list[dict[str, Any]] = []
-    for item in followed(found.items):
+    for item in followed(found).items:
         row = {"id": len(rows), "image_id": item.frame, "track_id": item.track, "category_id": 1}
         if item.mask is not None:
             mask = segmentation(Masks(height, width, (item.mask,)), 0)
             rows.append({**row, "segmentation": mask})
-    frames = sorted({item.frame for item in found.items})
+    frames = sorted(found.frames | {item.frame for item in found.items})
     tree = {
         "info": {} if fps is None else {"fps": fps},
         "images": [{"id": f, "width": width, "height": height} for f in frames],
@@ -140,30 +198,54 @@ def people_tree(found: Instances, fps: float | None = None) -> At:
     return At(tree, found.file)
 
 
-def _size_of(found: Instances, what: str) -> tuple[int, int]:
+def _size_of(found: Instances, what: str) -> Size:
     """Width and height [px]."""
     if found.size is None:
         raise InputError(f"{found.file}: has no size of the {what}, expected --image beside it")
     return found.size
 
 
-def followed(items: Sequence[Instance]) -> list[Instance]:
-    """Instances with a track each: those without one are numbered by score in their frame."""
-    frames: dict[int, list[Instance]] = {}
-    for item in items:
-        frames.setdefault(item.frame, []).append(item)
-    found: list[Instance] = []
-    for frame in sorted(frames):
-        used = {item.track for item in frames[frame]}
-        free = (n for n in range(len(frames[frame]) + len(used)) if n not in used)
-        seen: set[int | None] = set()
-        for item in sorted(frames[frame], key=lambda i: -i.score):
-            if item.track is None:
-                item = dataclasses.replace(item, track=next(free))
-            if item.track not in seen:
-                found.append(item)
-            seen.add(item.track)
-    return found
+def followed(found: Instances) -> Instances:
+    """The instances by frame, with a track each: those without one are followed by their places.
+
+    Of one track and frame that with the best score counts. Tracks that are made are numbered from
+    the left in the frame in which they start.
+    """
+    free = [item for item in found.items if item.track is None]
+    best: dict[tuple[int, int], Instance] = {}
+    for item in sorted(found.items, key=lambda i: -i.score):
+        if item.track is not None:
+            best.setdefault((item.frame, item.track), item)
+    notes = found.notes
+    if free:
+        boxes = np.array([_box_of(item, found.size) for item in free]).reshape(-1, 4)
+        order = np.lexsort((boxes[:, 0] + boxes[:, 2], [item.frame for item in free]))
+        boxes, free = boxes[order] / 2, [free[k] for k in order]
+        sizes = np.linalg.norm(boxes[:, 2:] - boxes[:, :2], axis=1)
+        frames = [item.frame for item in free]
+        lone = len(set(frames)) == len(frames)  # never two at a time: it is one person
+        tracks = [0] * len(free) if lone else bodies.followed(frames, boxes, sizes).tolist()
+        used = {track for _, track in best}
+        numbers = [n for n in range(len(used) + max(tracks) + 1) if n not in used]
+        for item, track in zip(free, tracks, strict=True):
+            key = item.frame, numbers[track]
+            best[key] = dataclasses.replace(item, track=numbers[track])
+        if len(free) > len(set(tracks)):
+            how = "one in each frame, taken as the same" if lone else "followed by their places"
+            notes = (*notes, f"{found.file}: people without tracks: {max(tracks) + 1}, {how}")
+    items = tuple(best[key] for key in sorted(best))
+    return dataclasses.replace(found, items=items, notes=notes)
+
+
+def _box_of(item: Instance, size: Size | None) -> Sequence[float]:
+    """The box of an instance: that of its mask where it has one [px]."""
+    if item.mask is None or size is None:
+        return item.box or (0.0, 0.0, 0.0, 0.0)
+    from pycocotools import mask as coco
+
+    code: Any = {"size": [size[1], size[0]], "counts": item.mask}
+    x, y, w, h = coco.toBbox(code).tolist()  # pyright: ignore
+    return x, y, x + w, y + h
 
 
 def with_reference_people(people: At | None, found: Instances, folder: Path) -> At:

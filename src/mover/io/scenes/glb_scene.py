@@ -19,9 +19,9 @@ from mover.geometry.rotations import affine
 from mover.io.capture.parts import Hints, Parts
 from mover.io.files.fields import At, maybe, reason
 from mover.io.files.images import image_size
-from mover.io.files.meshes import gltf_tree
+from mover.io.files.looks import gltf_tree, load_parts, looks_lost
 from mover.io.people.values import natural
-from mover.io.scenes.placing import FLIP, Matrix, Pieces, category_of_name, load_parts, placed
+from mover.io.scenes.placing import FLIP, Matrix, Pieces, category_of_name, placed
 
 UP: dict[str, Matrix] = {
     "y": np.eye(3),
@@ -41,7 +41,7 @@ def glb_parts(path: Path, hints: Hints) -> Parts:
     """
     if not path.is_file() or path.suffix.lower() not in (".glb", ".gltf"):
         raise InputError(f"{path}: is no .glb or .gltf file, expected a glTF scene")
-    scene = load_parts(path)
+    scene = load_parts(At(path.name, path.parent.name), path)
     turn = affine(up_axes(hints.up))
     view = None if hints.camera is not None else _view(path, hints)
     if view is not None:
@@ -59,7 +59,8 @@ def glb_parts(path: Path, hints: Hints) -> Parts:
     if not found.rows:
         raise InputError(f"{path.name}: has no meshes, expected a glTF scene of furniture")
     parts = found.parts(path.stem, path.name, _ground(scene, turn))
-    return dataclasses.replace(parts, camera=camera)
+    lost = looks_lost(path)
+    return dataclasses.replace(parts, camera=camera, notes=(*parts.notes, *[lost] * bool(lost)))
 
 
 def up_axes(up: str) -> Matrix:

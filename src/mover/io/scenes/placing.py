@@ -17,7 +17,7 @@ from mover.geometry.rotations import affine
 from mover.io.capture.parts import UNKNOWN, Parts
 from mover.io.capture.scene_file import scene_tree
 from mover.io.files.fields import At, reason
-from mover.io.files.meshes import check_gltf, mesh_of
+from mover.io.files.meshes import mesh_of
 
 EXACT = 1e-4  # [share], below it a matrix is a yaw and a scale
 MOST_TILT = math.radians(30)  # a tool's error of an upright thing; beyond, the axes are others
@@ -133,30 +133,6 @@ def level_of(up_cam: Matrix) -> Matrix:
     out: Matrix = np.empty((3, 3))
     out[:, 0], out[:, 1], out[:, 2] = np.cross(up, back), up, back
     return out
-
-
-def load_parts(path: Path) -> Any:  # noqa: ANN401
-    """A mesh file with materials and textures, as trimesh has it.
-
-    Raises:
-        InputError: If it cannot be read, or names files outside of its folder.
-    """
-    import warnings
-
-    import trimesh
-
-    at = At(path.name, path.name)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            check_gltf(at, path, pictures=True)
-            return trimesh.load_scene(str(path), process=False)
-        except InputError:
-            raise
-        except Exception as error:  # the parsers raise anything on broken files
-            raise InputError(
-                f"{path.name}: cannot be read ({reason(error)}), expected a mesh"
-            ) from error
 
 
 def write_parts(scene: Any, matrix: Matrix, path: Path) -> tuple[Mesh, str]:  # noqa: ANN401

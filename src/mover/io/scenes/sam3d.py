@@ -19,8 +19,20 @@ from mover.core.errors import InputError
 from mover.geometry.rotations import affine
 from mover.io.capture.parts import Hints, Parts
 from mover.io.files.cameras import GUESSED, read_camera_file, with_spread
-from mover.io.files.fields import At, array, get, mapping, maybe, number, read_json, refuse, text
+from mover.io.files.fields import (
+    At,
+    array,
+    get,
+    listed,
+    mapping,
+    maybe,
+    number,
+    read_json,
+    refuse,
+    text,
+)
 from mover.io.files.images import image_size
+from mover.io.files.looks import is_cloud, load_parts, looks_lost
 from mover.io.files.meshes import KINDS
 from mover.io.files.npz import read_npz
 from mover.io.files.schema import rotation
@@ -31,7 +43,6 @@ from mover.io.scenes.placing import (
     Pieces,
     category_of_name,
     level_of,
-    load_parts,
     placed,
 )
 
@@ -39,6 +50,8 @@ TO_LOCAL = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 """The stored mesh (+y up) -> the frame of the pose (+z up)."""
 TO_OPENCV = np.diag([-1.0, -1.0, 1.0])
 """PyTorch3D's camera (x left, y up) -> x right, y down."""
+POSES = {".npz": read_npz, ".json": read_json}
+"""What the pose beside a mesh may be."""
 PEOPLE = ("human", "person", "body")
 """Names of meshes that are people, in folders of the tool's notebooks."""
 
@@ -55,13 +68,7 @@ def sam3d_parts(folder: Path, hints: Hints) -> Parts:
     if camera is None and lens.is_file():
         size = None if hints.image is None else image_size(hints.image)
         camera = with_spread(read_camera_file(lens, size), GUESSED)
-    paths = [
-        path for path in folder.iterdir()
-        if path.suffix.lower() in KINDS and not path.stem.lower().startswith(PEOPLE)
-    ]  # fmt: skip
-    paths.sort(key=lambda p: (len(p.stem) if p.stem.isdecimal() else 0, p.stem))
-    if not paths:
-        raise InputError(f"{folder}: has no meshes, expected <name>.glb with <name>.npz or .json")
+    paths, notes = _things(folder)
     poses = [_pose_beside(path) for path in paths]
     matrices = [pose_matrix(pose) for pose in poses]
     R, how = _attitude(camera, matrices)
@@ -70,19 +77,49 @@ def sam3d_parts(folder: Path, hints: Hints) -> Parts:
         words = (maybe(pose, key) for key in ("category", "label", "class"))
         said = next((text(at) for at in words if at is not None), None)
         name = hints.names.get(path.stem) or said or category_of_name(path.stem)
-        found.add(
-            name, path.stem, partial(placed, load_parts(path), affine(R.T) @ matrix, hints.work)
-        )
+        parts = load_parts(At(path.name, folder.name), path)
+        found.add(name, path.stem, partial(placed, parts, affine(R.T) @ matrix, hints.work))
+        notes += [lost] if (lost := looks_lost(path)) else []
     if camera is not None:
         camera = At({**camera.value, "R_cam_world": R.tolist()}, camera.file)
     return dataclasses.replace(
-        found.parts(folder.resolve().name, folder.name), camera=camera, notes=(how, *found.notes)
+        found.parts(folder.resolve().name, folder.name),
+        camera=camera,
+        notes=(how, *notes, *found.notes),
     )
+
+
+def _things(folder: Path) -> tuple[list[Path], list[str]]:
+    """The meshes of a folder that have a pose, by number or name, and what is passed over."""
+    paths = [
+        path for path in folder.iterdir()
+        if path.suffix.lower() in KINDS and not path.stem.lower().startswith(PEOPLE)
+    ]  # fmt: skip
+    paths.sort(key=lambda p: (len(p.stem) if p.stem.isdecimal() else 0, p.stem,
+                              KINDS.index(p.suffix.lower())))  # fmt: skip
+    clouds = [path for path in paths if is_cloud(path)]
+    meshes = [path for path in paths if path not in clouds]
+    once = [p for k, p in enumerate(meshes) if p.stem not in [other.stem for other in meshes[:k]]]
+    posed = [p for p in once if any(p.with_suffix(kind).is_file() for kind in POSES)] or once
+    if not posed:
+        found = f"{len(clouds)} files of points or splats, " if clouds else ""
+        wanted = "expected <name>.glb with <name>.npz or .json"
+        raise InputError(f"{folder}: has {found}no meshes, {wanted}")
+    notes = [
+        f"{listed('file', [p.name for p in passed])} {why}: passed over"
+        for passed, why in (
+            (clouds, "of points without faces, as Gaussian splats are"),
+            ([p for p in meshes if p not in once], "of the name of another mesh"),
+            ([p for p in once if p not in posed], "without a pose beside it"),
+        )
+        if passed
+    ]
+    return posed, notes
 
 
 def _pose_beside(path: Path) -> At:
     """The pose beside a mesh, arrays as lists."""
-    for kind, read in ((".npz", read_npz), (".json", read_json)):
+    for kind, read in POSES.items():
         own = path.with_suffix(kind)
         if own.is_file():
             at = read(own)

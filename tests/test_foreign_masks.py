@@ -1,0 +1,292 @@
+"""Masks as other tools and people leave them: frames, tracks, soft rims, dumps, many images."""
+
+import json
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import make_scenes as layouts
+import numpy as np
+import pytest
+from PIL import Image
+
+from mover.core.errors import InputError
+from mover.core.types import Masks
+from mover.geometry.rle import decode
+from mover.io.masks.instance_files import read_people, read_things
+from mover.io.masks.instances import Instances
+
+H, W = 48, 64
+KEPT = (0, 1, 2, 6, 7)
+"""Frames in which somebody is; between them nobody is."""
+
+
+def walker(frame: int, start: int = 4) -> np.ndarray:
+    mask = np.zeros((H, W), dtype=bool)
+    mask[10:40, start + 2 * frame : start + 2 * frame + 14] = True
+    return mask
+
+
+def pixels(found: Instances) -> dict[tuple[int, int | None], np.ndarray]:
+    assert found.size == (W, H)
+    return {(i.frame, i.track): decode(Masks(H, W, (i.mask or b"",)), 0).numpy()
+            for i in found.items}  # fmt: skip
+
+
+def code(mask: np.ndarray) -> dict[str, Any]:
+    return {"size": [H, W], "counts": layouts.compressed(layouts.runs_of(mask))}
+
+
+def white(mask: np.ndarray) -> Image.Image:
+    return Image.fromarray((mask * 255).astype(np.uint8))
+
+
+def of_pictures(name: str, soft: bool = False, home: str = "") -> Callable[[Path], Path]:
+    """Writes a picture a frame; names have the number in their format."""
+
+    def write(folder: Path) -> Path:
+        (folder / home).mkdir(parents=True)
+        for frame in KEPT:
+            picture = white(walker(frame))
+            if soft:
+                half = picture.resize((W // 2, H // 2), Image.Resampling.LANCZOS)
+                picture = half.resize((W, H), Image.Resampling.LANCZOS)
+            picture.save(folder / home / name.format(frame, frame + 1))
+        return folder
+
+    return write
+
+
+def results(first: int) -> Callable[[Path], Path]:
+    """A list of detections of COCO without those frames in which there is nobody."""
+
+    def write(folder: Path) -> Path:
+        rows = [{"image_id": k + first, "category_id": 1, "score": 0.9,
+                 "segmentation": code(walker(k))} for k in KEPT]  # fmt: skip
+        folder.mkdir()
+        (folder / "results.json").write_text(json.dumps(rows))
+        return folder / "results.json"
+
+    return write
+
+
+def coco(named: str, first: int) -> Callable[[Path], Path]:
+    """COCO with all images, of which some have no annotation; ids from `first`."""
+
+    def write(folder: Path) -> Path:
+        images = [{"id": k + first, "width": W, "height": H, "file_name": named.format(k)}
+                  for k in range(8)]  # fmt: skip
+        rows = [{"id": k, "image_id": k + first, "category_id": 3, "segmentation": code(walker(k))}
+                for k in KEPT]  # fmt: skip
+        names = [{"id": 3, "name": "Person"}]
+        folder.mkdir()
+        tree = {"images": images, "annotations": rows, "categories": names}
+        (folder / "a.json").write_text(json.dumps(tree))
+        return folder / "a.json"
+
+    return write
+
+
+def segments(folder: Path) -> Path:
+    """video_segments of sam2's notebooks/video_predictor_example.ipynb, pickled."""
+    folder.mkdir()
+    tree = {k: {1: walker(k)[None]} for k in KEPT}
+    (folder / "video_segments.pkl").write_bytes(pickle.dumps(tree))
+    return folder / "video_segments.pkl"
+
+
+def mask_data(folder: Path) -> Path:
+    """mask_data/ and json_data/ of grounded_sam2_tracking_demo_with_continuous_id.py."""
+    for name in ("mask_data", "json_data"):
+        (folder / name).mkdir(parents=True)
+    for k in KEPT:
+        labels = walker(k) * 2 + (walker(k, 34) & (k < 6)) * 5
+        np.save(folder / "mask_data" / f"mask_{k:05d}.npy", labels.astype(np.uint16))
+        about = {
+            str(n): {"instance_id": n, "class_name": name, "x1": 0, "y1": 0, "x2": 0, "y2": 0,
+                     "logit": 0.0}
+            for n, name in ((2, "person"), (5, "chair"))
+        }  # fmt: skip
+        tree = {"mask_name": f"mask_{k:05d}.npy", "mask_height": H, "mask_width": W,
+                "promote_type": "mask", "labels": about}  # fmt: skip
+        (folder / "json_data" / f"mask_{k:05d}.json").write_text(json.dumps(tree))
+    return folder
+
+
+VIDEOS = {  # how a walker is written, and his track
+    "frame_0001.png": (of_pictures("frame_{1:04d}.png"), 0),
+    "1.png": (of_pictures("{1}.png"), 0),
+    "000000.jpg": (of_pictures("{0:06d}.jpg"), 0),
+    "mask_00000_soft.png": (of_pictures("mask_{0:05d}.png", soft=True), 0),
+    "000001/00000.png": (of_pictures("{0:05d}.png", home="000007"), 7),
+    "results from 1": (results(1), 0),
+    "results from 0": (results(0), 0),
+    "coco from 1": (coco("", 1), 0),
+    "coco of cvat": (coco("frame_{:06d}.PNG", 1), 0),
+    "segments": (segments, 1),
+    "mask_data": (mask_data, 2),
+}
+
+
+@pytest.mark.parametrize("way", VIDEOS)
+def test_frames_keep_their_numbers_over_gaps_and_a_person_is_one_track(
+    way: str, tmp_path: Path
+) -> None:
+    write, track = VIDEOS[way]
+    got = pixels(read_people(write(tmp_path / "in"), {}, None))
+    assert list(got) == [(frame, track) for frame in KEPT]
+    for (frame, _), mask in got.items():
+        off = (mask ^ walker(frame)).sum() / walker(frame).sum()
+        assert off <= (0.15 if "soft" in way or "jpg" in way else 0)
+
+
+@pytest.mark.parametrize(
+    ("way", "said"),
+    [
+        ("frame_0001.png", "numbers 1 to 8 with 3 left out count from 1: 1 is frame 0"),
+        ("results from 1", "image_ids 1 to 8 with 3 left out count from 1"),
+        ("frame_0001.png", "white masks are one person"),
+        ("results from 0", "people without tracks: 1, one in each frame"),
+    ],
+)
+def test_what_is_decided_of_frames_and_tracks_is_said(way: str, said: str, tmp_path: Path) -> None:
+    notes = read_people(VIDEOS[way][0](tmp_path / "in"), {}, None).notes
+    assert any(said in note for note in notes), notes
+
+
+def test_frames_without_people_are_frames_that_were_looked_at(tmp_path: Path) -> None:
+    assert read_people(coco("", 1)(tmp_path / "in"), {}, None).frames == set(range(8))
+
+
+@pytest.mark.parametrize("boxes", [True, False])
+def test_people_without_tracks_are_followed_by_place_not_by_score(
+    boxes: bool, tmp_path: Path
+) -> None:
+    """The one with the better score alternates, and so does their order (k34)."""
+    rows: list[dict[str, Any]] = []
+    for k in range(12):
+        pair = [{"image_id": k, "category_id": 1, "segmentation": code(walker(j * k, start)),
+                 **({"bbox": [0, 0, 1, 1]} if boxes else {}),
+                 "score": 0.9 if (j + k) % 2 else 0.8}
+                for j, start in ((0, 2), (1, 24))]  # fmt: skip
+        rows += pair[:: 1 if k % 3 else -1]
+    (tmp_path / "a.json").write_text(json.dumps(rows))
+    got = pixels(read_people(tmp_path / "a.json", {}, None))
+    for k in range(12):
+        assert (got[k, 0] == walker(0, 2)).all()
+        assert (got[k, 1] == walker(k, 24)).all()
+
+
+def test_a_stack_of_frames_is_a_person_and_one_of_apart_masks_are_people(tmp_path: Path) -> None:
+    np.save(tmp_path / "frames.npy", np.stack([walker(k) for k in range(6)])[:, None])
+    got = pixels(read_people(tmp_path / "frames.npy", {}, None))
+    assert list(got) == [(k, 0) for k in range(6)]
+    np.save(
+        tmp_path / "people.npy", np.stack([walker(0, 0), walker(0, 20), walker(0, 40)])[:, None]
+    )
+    found = read_people(tmp_path / "people.npy", {}, None)
+    assert list(pixels(found)) == [(0, 0), (0, 1), (0, 2)]
+    assert any("3 masks are people of one image" in note for note in found.notes)
+
+
+def test_soft_labels_are_labels_and_a_dancer_is_a_person(tmp_path: Path) -> None:
+    both = walker(0) * 85 + walker(0, 40) * 170
+    folder = tmp_path / "in"
+    folder.mkdir()
+    big = Image.fromarray(both.astype(np.uint8)).resize((W * 4, H * 4), Image.Resampling.BILINEAR)
+    big.save(folder / "00000.png")
+    found = read_things(folder, {"85": "chair", "170": "sofa"}, None)
+    assert [i.category for i in found.items] == ["chair", "sofa"]
+    rows = [{"class": "dancer", "bbox": [0, 0, 9, 9, 1.0], "mask": walker(0).tolist()}]
+    (tmp_path / "a.json").write_text(json.dumps(rows))
+    people = read_people(tmp_path / "a.json", {}, None)
+    assert len(people.items) == 1
+    assert any("'dancer' taken as people's" in note for note in people.notes)
+
+
+# Things in one picture.
+
+
+def grounded(folder: Path) -> Path:
+    """DUMP_JSON_RESULTS of grounded_sam2_local_demo.py; scores as SAM 2 has them, lists of one."""
+    row = {"class_name": "chair", "bbox": [4.0, 10.0, 18.0, 40.0],
+           "segmentation": code(walker(0)), "score": [1.02]}  # fmt: skip
+    tree = {"image_path": "notebooks/images/a.jpg", "annotations": [row], "box_format": "xyxy",
+            "img_width": W, "img_height": H}  # fmt: skip
+    (folder / "a.json").write_text(json.dumps(tree))
+    return folder / "a.json"
+
+
+def mmdet(folder: Path) -> Path:
+    """outputs/preds/a.json of mmdet's DetInferencer (mmdet/apis/det_inferencer.py: pred2dict)."""
+    tree = {"labels": [56, 0, 60], "scores": [0.9, 0.8, 0.05],
+            "bboxes": [[4, 10, 18, 40], [0, 0, 9, 9], [0, 0, 5, 5]],
+            "masks": [code(walker(0)), code(walker(3, 30)), code(walker(0, 9))]}  # fmt: skip
+    (folder / "a.json").write_text(json.dumps(tree))
+    return folder / "a.json"
+
+
+@pytest.mark.parametrize("write", [grounded, mmdet])
+def test_results_of_detectors_are_read(write: Callable[[Path], Path], tmp_path: Path) -> None:
+    found = read_things(write(tmp_path), {}, None)
+    (item,) = found.items
+    assert item.category == "chair"
+    assert item.box == (4, 10, 18, 40)
+    assert (pixels(found)[0, None] == walker(0)).all()
+    assert 0.9 <= item.score <= 1
+
+
+def many_images(folder: Path) -> Path:
+    """What CVAT exports of a task of several pictures."""
+    names = ("kitchen.jpg", "images/Room.JPG", "next.jpg")
+    images = [{"id": k, "width": W + 2 * (k == 0), "height": H, "file_name": name}
+              for k, name in enumerate(names)]  # fmt: skip
+    rows = [{"id": k, "image_id": k, "category_id": k, "segmentation": [[k, 0, 9, 0, 9, 9]],
+             "bbox": [0, 0, 9, 9], "iscrowd": 0} for k in range(3)]  # fmt: skip
+    names = [{"id": k, "name": name} for k, name in enumerate(("table", "chair", "bed"))]
+    tree = {"images": images, "annotations": rows, "categories": names}
+    (folder / "instances.json").write_text(json.dumps(tree))
+    return folder / "instances.json"
+
+
+def test_of_many_images_only_ours_counts_and_this_is_said(tmp_path: Path) -> None:
+    path = many_images(tmp_path)
+    found = read_things(path, {}, (W, H), "room.png")
+    assert [i.category for i in found.items] == ["chair"]
+    assert found.notes == ("instances.json: of 3 images only images/Room.JPG is taken",)
+    with pytest.raises(InputError, match=r"3 images \(kitchen.jpg, .*expected one called x.png"):
+        read_things(path, {}, (W, H), "x.png")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.json", [{"id": 1, "annotations": [{"result": []}], "data": {"image": "a"}}],
+         "Label Studio's JSON, expected its export as COCO"),
+        ("a.json", {"a.jpg1": {"filename": "a.jpg", "regions": []}}, "project of VIA"),
+        ("a.json", [{"image": "a.jpg", "id": 7}], r"\[0\].*bbox, segmentation or mask"),
+        ("a.xml", "<?xml?><annotations><version>1.1</version></annotations>", "CVAT's XML"),
+        ("a.xml", "<annotation><object/></annotation>", "an XML of Pascal VOC"),
+        ("a.txt", "56 0.31 0.6 0.2 0.4", "YOLO's text"),
+        ("a.zip", "PK", "unpack it"),
+    ],
+)  # fmt: skip
+def test_what_is_not_read_is_named_with_its_export(
+    name: str, content: Any, words: str, tmp_path: Path
+) -> None:
+    text = content if isinstance(content, str) else json.dumps(content)
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=words):
+        read_things(tmp_path / name, {}, (W, H))
+
+
+@pytest.mark.parametrize("nothing", [[], [[]], None])
+def test_a_box_without_mask_is_a_box(nothing: Any, tmp_path: Path) -> None:
+    row = {"id": 1, "image_id": 0, "category_id": 1, "bbox": [4, 10, 14, 30],
+           "segmentation": nothing}  # fmt: skip
+    tree = {"images": [{"id": 0, "width": W, "height": H}], "annotations": [row],
+            "categories": [{"id": 1, "name": "chair"}]}  # fmt: skip
+    (tmp_path / "a.json").write_text(json.dumps(tree))
+    (item,) = read_things(tmp_path / "a.json", {}, None).items
+    assert (item.box, item.mask) == ((4, 10, 18, 40), None)
