@@ -19,22 +19,11 @@ from mover.core.errors import InputError
 from mover.core.types import Scene
 from mover.energy.body_energy import BODY_TERMS
 from mover.energy.body_terms import deviation_term, robust_square, second_difference
+from mover.fitting import priors
 from mover.fitting.bodies import FitInputs, fit_bodies
 from mover.fitting.config import PAPER, PUBLISHED, STAGES, FitConfig, Stage
 from mover.fitting.energy import FitState
 from mover.fitting.ground import balance_cost, center_of_mass, standing_share
-from mover.fitting.priors import (
-    UNKNOWN,
-    bent_wrong,
-    excess_of,
-    height_cost,
-    lasting_of,
-    limit_table,
-    resting,
-    shape_cost,
-    size_of,
-    stature_of,
-)
 from mover.fitting.start import placed
 from mover.fitting.tracks import best_path, motion_of, seen_of
 from mover.fitting.unknowns import Frame, Unknowns, move, points_of, rig_of
@@ -99,15 +88,15 @@ def test_lasting_offsets_of_a_detector_do_not_change_the_stature(walk):
 
 def test_the_shape_costs_its_proportions_and_the_height_beside_those_of_adults():
     usual, dirs = heights_of(open_body())
-    unknown = stature_of(open_body(), (), torch.arange(2), torch.arange(2))
+    unknown = priors.stature_of(open_body(), (), torch.arange(2), torch.arange(2))
     taller = (1.78 - usual) * dirs / dirs.square().sum()  # one standard deviation above the mean
     aside = torch.zeros(10)
     aside[[0, 2]] = torch.stack([-dirs[2], dirs[0]]) / dirs[[0, 2]].norm()
     betas = torch.stack([taller, taller + 2 * aside])
-    torch.testing.assert_close(shape_cost(unknown, betas), torch.tensor([1.0, 5.0]))
-    known = stature_of(open_body(), (1.78,), torch.arange(2), torch.arange(2))
+    torch.testing.assert_close(priors.shape_cost(unknown, betas), torch.tensor([1.0, 5.0]))
+    known = priors.stature_of(open_body(), (1.78,), torch.arange(2), torch.arange(2))
     torch.testing.assert_close(
-        shape_cost(known, betas), torch.tensor([0.0, 4.0]), atol=1e-4, rtol=0
+        priors.shape_cost(known, betas), torch.tensor([0.0, 4.0]), atol=1e-4, rtol=0
     )
 
 
@@ -127,7 +116,7 @@ def test_a_body_that_leans_as_a_whole_falls_and_one_that_stands_does_not(walk):
 
 
 def test_offsets_cost_their_squared_deviations_by_the_name_of_the_keypoint():
-    lasting = lasting_of(("left_hip", "nose", "left_index3"))
+    lasting = priors.lasting_of(("left_hip", "nose", "left_index3"))
     assert lasting.tolist() == pytest.approx([0.03, 0.015, 0.003])
     every = lasting[:, None].expand(3, 3).reshape(1, 9)
     assert float(deviation_term(every, lasting.repeat_interleave(3))) == pytest.approx(9)
@@ -184,7 +173,9 @@ def test_bodies_are_found_from_keypoints_alone(walk):
     found = fit(seen(walk, noise=3.0, missing=0.1), None)
     aligned, absolute = off(found, walk)
     assert aligned < 0.06
-    assert absolute < 1.1 * UNKNOWN * 4.0  # size and distance look the same: of adults, at 4 m
+    assert (
+        absolute < 1.1 * priors.UNKNOWN * 4.0
+    )  # size and distance look the same: of adults, at 4 m
     assert found.miss.mean() < 5
     assert found.bodies.pose.betas.unique(dim=0).shape[0] == 1
     verts, joints = open_body().posed(found.bodies.pose)
@@ -270,7 +261,7 @@ def test_rows_without_joints_are_left_out_and_nan_is_missing(walk):
     out = fit(bad, FEW)
     assert out.rows.tolist() == [0, 1, 3, 4, 5, 6, 8, 9, 10, 11]
     assert out.bodies.frame.tolist() == out.rows.tolist()
-    assert out.bodies.size_spread == UNKNOWN  # no height is given
+    assert out.bodies.size_spread == priors.UNKNOWN  # no height is given
     assert out.bodies.verts.isfinite().all()
     assert out.warnings == ("2 of 12 rows have fewer than 4 joints: left out",)
 
@@ -358,21 +349,21 @@ def test_costs_are_those_of_the_publication():
     torch.testing.assert_close(robust_square(r**2, 100.0), torch.tensor(wanted), rtol=1e-4, atol=0)
     elbow = torch.zeros(2, 63)
     elbow[1, 52] = 0.7  # the left elbow, backwards: index 55 of the full pose less the root's three
-    cost = bent_wrong(elbow).exp().square().sum(-1)
+    cost = priors.bent_wrong(elbow).exp().square().sum(-1)
     assert cost.tolist() == pytest.approx([4.0, 3 + np.exp(1.4)], rel=1e-5)
     assert PUBLISHED[2].pose == 57.4
 
 
 def test_limits_mirror_left_and_right_and_hold_the_resting_pose():
-    low, high, rest, _ = (row.reshape(21, 3) for row in limit_table())
+    low, high, rest, _ = (row.reshape(21, 3) for row in priors.limit_table())
     for left, right in ((0, 1), (3, 4), (15, 16), (17, 18), (19, 20)):
         assert torch.equal(low[left, 0], low[right, 0])
         torch.testing.assert_close(low[left, 1:], -high[right, 1:])
     assert ((low < rest) & (rest < high)).all()
-    pose = resting(1, torch.zeros(1))
-    assert float(excess_of(pose).max()) == 0
+    pose = priors.resting(1, torch.zeros(1))
+    assert float(priors.excess_of(pose).max()) == 0
     pose[0, 9] = np.radians(-9)  # the left knee forwards: 4 degrees beyond its limit
-    assert float(excess_of(pose).square().sum()) == pytest.approx(1, rel=1e-4)
+    assert float(priors.excess_of(pose).square().sum()) == pytest.approx(1, rel=1e-4)
 
 
 def test_the_energy_has_the_gradient_of_finite_differences(walk):
@@ -499,22 +490,24 @@ def test_the_preset_paper_weighs_motion_as_printed(walk):
 
 def test_heights_are_given_one_by_one_or_for_all():
     everybody = torch.tensor([4, 7, 4, 9])
-    one = stature_of(open_body(), (1.7,), everybody, torch.arange(4))
+    one = priors.stature_of(open_body(), (1.7,), everybody, torch.arange(4))
     assert one.given.tolist() == pytest.approx([1.7, 1.7, 1.7])
-    some = stature_of(open_body(), (1.6, 1.7, 1.8), everybody, torch.tensor([0, 2, 3]))
+    some = priors.stature_of(open_body(), (1.6, 1.7, 1.8), everybody, torch.tensor([0, 2, 3]))
     assert some.given.tolist() == pytest.approx([1.6, 1.8])  # nothing is seen of number 7
-    assert stature_of(open_body(), (), everybody, torch.arange(4)).given.isnan().all()
+    assert priors.stature_of(open_body(), (), everybody, torch.arange(4)).given.isnan().all()
     with pytest.raises(InputError, match="height: 2 are given, expected 1, or 3: one a person"):
-        stature_of(open_body(), (1.7, 1.8), everybody, torch.arange(4))
+        priors.stature_of(open_body(), (1.7, 1.8), everybody, torch.arange(4))
 
 
 def test_the_height_of_numbers_of_the_shape_is_that_of_the_body():
     betas = torch.tensor([[1.5, -1.0, 0.5], [0.0, 2.0, 0.0]])
     y = shaped(open_body(), betas)[0][..., 1]
     tall = y.amax(-1) - y.amin(-1)
-    known = stature_of(open_body(), tuple((tall + 0.02).tolist()), torch.arange(2), torch.arange(2))
+    known = priors.stature_of(
+        open_body(), tuple((tall + 0.02).tolist()), torch.arange(2), torch.arange(2)
+    )
     torch.testing.assert_close(
-        height_cost(known, betas), torch.full((2,), 4e-4), atol=1e-4, rtol=0.2
+        priors.height_cost(known, betas), torch.full((2,), 4e-4), atol=1e-4, rtol=0.2
     )
 
 
@@ -537,6 +530,6 @@ def test_larger_bodies_do_not_move_less_smoothly(walk):
         larger = dataclasses.replace(state)
         larger.__dict__["points"] = points
         costs.append(TERM["smooth_joints"](larger).sum())
-    torch.testing.assert_close(size_of(1.1 * walk.joints), 1.1 * size_of(walk.joints))
+    torch.testing.assert_close(priors.size_of(1.1 * walk.joints), 1.1 * priors.size_of(walk.joints))
     torch.testing.assert_close(*costs)
     assert costs[0] > 0

@@ -14,16 +14,10 @@ from mover.bodies.skinning import open_body
 from mover.core.types import Bodies
 from mover.energy.body_energy import BODY_TERMS
 from mover.energy.body_terms import SIGMA_HELD, deviation_term, robust_square
+from mover.fitting import ground
 from mover.fitting.bodies import FitInputs, fit_bodies
 from mover.fitting.config import STAGES, FitConfig
 from mover.fitting.energy import UPPER
-from mover.fitting.ground import (
-    distances_of_lying_people,
-    plane_of,
-    sole_heights,
-    soles_of,
-    trunk_of,
-)
 from mover.fitting.priors import excess_of, limit_table, off_pose, resting, spreads
 from mover.fitting.start import BACK, lying_guesses, turned_round, upright_guesses
 from mover.fitting.tracks import CALM, joint_speed, motion_of
@@ -141,12 +135,12 @@ def test_a_person_lying_along_the_view_is_expected_where_they_sat_before_and_aft
     joints = lying_down([4.0] * 4 + [4.9] * 5 + [4.4] * 4, upright + [0.0] * 5 + upright)
     time = torch.arange(13) / 5
     track = [torch.arange(13)]
-    found = distances_of_lying_people(joints, torch.tensor([0.0, -1, 0]), track, time)
+    found = ground.distances_of_lying_people(joints, torch.tensor([0.0, -1, 0]), track, time)
     assert found[:4].isnan().all()
     assert found[9:].isnan().all()
     between = torch.linspace(math.log(4.0), math.log(4.4), 7)[1:-1]
     torch.testing.assert_close(found[4:9], between)
-    alone = distances_of_lying_people(
+    alone = ground.distances_of_lying_people(
         joints[4:9], torch.tensor([0.0, -1, 0]), [torch.arange(5)], time[4:9]
     )
     assert alone.isnan().all()  # it is not known where they came from
@@ -156,7 +150,7 @@ def test_a_body_across_the_view_shows_its_distance_itself():
     joints = lying_down([4.0, 4.9, 4.0], [1.5, 0.0, 1.5])
     joints[1, BODY.index("neck")] = torch.tensor([0.5, 0.0, 4.9])
     track = [torch.arange(3)]
-    found = distances_of_lying_people(
+    found = ground.distances_of_lying_people(
         joints, torch.tensor([0.0, -1, 0]), track, torch.arange(3) / 5
     )
     assert found.isnan().all()
@@ -164,16 +158,16 @@ def test_a_body_across_the_view_shows_its_distance_itself():
 
 def test_a_leaning_floor_lies_where_its_soles_are():
     up = torch.nn.functional.normalize(torch.tensor([0.1, -1.0, 0.2]), dim=0)
-    leaned, height = plane_of(torch.tensor([0.05, -0.03, -1.4]), up, None)
+    leaned, height = ground.plane_of(torch.tensor([0.05, -0.03, -1.4]), up, None)
     assert float(leaned.norm()) == pytest.approx(1)
     assert float(leaned @ up) == pytest.approx(1 / math.sqrt(1 + 0.05**2 + 0.03**2))
     assert float(height) == pytest.approx(-1.4)
     joints = torch.zeros(1, 22, 3)
-    soles = soles_of(open_body())
+    soles = ground.soles_of(open_body())
     for side, more in (("left", 0.2), ("right", 0.0)):  # the left foot is lifted
         for joint, over in zip(("ankle", "foot"), soles, strict=True):
             joints[0, BODY.index(f"{side}_{joint}")] = (height + over + more) * leaned
-    assert float(sole_heights(joints, soles, leaned)) == pytest.approx(-1.4, abs=1e-5)
+    assert float(ground.sole_heights(joints, soles, leaned)) == pytest.approx(-1.4, abs=1e-5)
 
 
 def test_upright_bodies_are_symmetric_and_nearly_straight_where_they_stand():
@@ -228,7 +222,7 @@ def sleeper(rolls: torch.Tensor, head: float) -> Bodies:
 def test_a_person_lying_along_the_view_has_the_head_where_it_is(roll, head):
     truth = sleeper(torch.full((10,), roll), head)
     found = fit_bodies(FitInputs(seen(truth, "coco17", noise=4.0), CAMERA, open_body()), STARTED)
-    along = (trunk_of(found.bodies.joints) * trunk_of(truth.joints)).sum(-1)
+    along = (ground.trunk_of(found.bodies.joints) * ground.trunk_of(truth.joints)).sum(-1)
     assert along.min() > 0.9
     miss = found.bodies.joints[:, :22] - truth.joints[:, :22]
     assert (miss - miss[:, :1]).norm(dim=-1).mean() < 0.12

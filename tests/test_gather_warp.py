@@ -41,6 +41,7 @@ def assert_same(verts: Tensor, faces: Tensor, grid: Volume) -> Tensor:
     return found
 
 
+@pytest.mark.slow
 def test_posed_bodies_have_the_distances_of_libigl() -> None:
     verts, faces = posed_bodies(3)
     assert (assert_same(verts, faces, around(verts, 96)) < 0).any()
@@ -238,6 +239,7 @@ def test_bricks_are_busy_where_the_field_changes() -> None:
         assert bool(field.busy[tuple(brick)]) == (field.values[cut].unique().numel() > 1)
 
 
+@pytest.mark.slow
 def test_a_mesh_in_great_pieces_has_the_distances_of_libigl() -> None:
     """Lists of leaves that are too long, and places inside that begin at the grid's border."""
     verts, faces = sphere([0.0, 0, 0], 0.5, level=4)

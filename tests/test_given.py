@@ -352,7 +352,7 @@ def test_feet_that_stand_level_stay_as_they_are(name: str) -> None:
 
 
 def test_a_foot_that_hangs_comes_down_and_the_box_stays() -> None:
-    for seed in range(6):
+    for seed in range(3):
         mesh = foreign_mesh(
             make_piece("table", np.random.default_rng(seed)), 0.03, np.random.default_rng(seed)
         )
