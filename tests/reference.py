@@ -1,20 +1,27 @@
-"""Who draws in a test: the kernels, or plain torch; see `drawn_by`."""
+"""What draws in a test: the kernels, or plain torch."""
 
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Generator
+from contextlib import contextmanager
 from types import ModuleType
 
+import pytest
 import raster_torch
 import torch
 
+from mover.energy.fused import energy
 from mover.geometry import raster
-from mover.geometry.raster import drawn_by
 
 
-def use_engine(name: str) -> AbstractContextManager[None]:
-    """Inside the block "torch" or "warp" draws."""
-    return drawn_by(raster_torch) if name == "torch" else nullcontext()
+@contextmanager
+def use_engine(name: str) -> Generator[None, None, None]:
+    """Inside the block "torch" or "warp" draws and sums."""
+    with pytest.MonkeyPatch.context() as patch:
+        if name == "torch":
+            patch.setattr(raster, "_reference_of", lambda _: raster_torch)
+            patch.setattr(energy, "fused_energy", lambda *_: None)
+        yield
 
 
 def reference_of(verts_cam: torch.Tensor) -> ModuleType | None:
     """Torch for double precision, which the kernels do not have and tests of gradients need."""
-    return raster_torch if verts_cam.dtype == torch.float64 else raster._reference.get()
+    return raster_torch if verts_cam.dtype == torch.float64 else None

@@ -13,7 +13,7 @@ from test_raster import PINHOLE, edges_of, packed, posed, poses, slab, window
 
 from mover.geometry import raster
 from mover.geometry import raster as raster_warp
-from mover.geometry.raster import Crops, Topology, drawn_by, engine
+from mover.geometry.raster import Crops, Topology
 from mover.geometry.warp_start import _cores, threads, use_threads
 
 wp = pytest.importorskip("warp")
@@ -193,14 +193,6 @@ class TestBadInput:
 
 
 class TestEngine:
-    def test_a_reference_draws_inside_its_block_only(self):
-        inputs = scene(["sphere"], 24)
-        assert engine() == "warp"
-        with drawn_by(raster_torch):
-            assert engine() == "torch"
-            assert torch.equal(raster.look(*inputs)[0], raster_torch.look(*inputs)[0])
-        assert engine() == "warp"
-
     @pytest.mark.parametrize(("asked", "count"), [("3", 3), ("0", None), ("many", None)])
     def test_threads_are_those_of_openmp_else_one_a_core(self, asked, count, monkeypatch):
         monkeypatch.setenv("OMP_NUM_THREADS", asked)

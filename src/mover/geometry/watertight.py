@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch.nn.functional import interpolate
 
 from mover.core.types import Mesh
 from mover.geometry.mesh import decimate, fit_box, used
@@ -33,7 +34,7 @@ REST = 0.3  # of the thickness of the wall that stays: sheets need two sides tha
 REACH = 3.0  # [walls], vertices further from the triangles stay where they are: lids over holes
 INSIDE = 0.85  # winding number from which a place that the flood reached still counts as matter
 LID = 4.0  # [cells] over which a winding number that is larger by 1 would lower the field
-FAR = 4  # [cells], step of the first look at the winding numbers
+FAR = 4  # [cells], step between winding numbers far from the triangles
 MARGIN = 2  # [cells] of air around the box
 SPECK = 1e-3  # of the largest component's volume: what is smaller is no part of the furniture
 
@@ -82,47 +83,24 @@ def _windings(
     near: np.ndarray,
     air: np.ndarray,
 ) -> np.ndarray:
-    """Winding number, of either sign, of the air's places; zero elsewhere.
+    """Winding number, of either sign, of the air's positions; zero elsewhere.
 
-    It changes little from one place to the next but across triangles, between which and the air
-    stands a wall. So it is measured at every fourth place along the axes, and what lies between
-    places of known winding numbers takes their mean: far from the triangles at once, near them
-    (within `SHELL` cells) in the last step, which is shorter than a wall is thick.
+    It changes little from one to the next but across triangles: it is exact near them (within
+    `SHELL` cells), and interpolated between every fourth position along the axes elsewhere.
     """
     import igl
 
-    winding, known = np.zeros(air.shape), np.ones(air.shape, dtype=bool)
-    first = np.floor((verts.min(0) - start) / cell).astype(int) + 1
-    last = np.ceil((verts.max(0) - start) / cell).astype(int)
-    known[tuple(slice(a, b) for a, b in zip(first, last, strict=True))] = False  # the box
-    for step in (FAR, FAR // 2, 1):
-        some = np.s_[::step, ::step, ::step]
-        if step < FAR:
-            _draw_between(winding[some], known[some], (air if step == 1 else air & ~near)[some])
-        left = air[some] & ~known[some]
-        at = np.argwhere(left)
-        found = igl.fast_winding_number(verts, faces, start + cell * step * at)
-        winding[some][left], known[some][left] = np.abs(found), True
+    counts = [-(-(n - 1) // FAR) + 1 for n in air.shape]
+    places = start + cell * FAR * np.argwhere(np.ones(counts, dtype=bool))
+    coarse = np.abs(igl.fast_winding_number(verts, faces, places)).reshape(1, 1, *counts)
+    size = [FAR * (n - 1) + 1 for n in counts]
+    whole = interpolate(torch.from_numpy(coarse), size, mode="trilinear", align_corners=True)
+    x, y, z = air.shape
+    winding = np.where(air, whole[0, 0, :x, :y, :z].numpy(), 0.0)
+    exact = air & near
+    places = start + cell * np.argwhere(exact)
+    winding[exact] = np.abs(igl.fast_winding_number(verts, faces, places))
     return winding
-
-
-def _draw_between(winding: np.ndarray, known: np.ndarray, allowed: np.ndarray) -> None:
-    """Means of known neighbours where every second place along the axes was measured, in place."""
-    for axis in range(3):
-        row = [slice(None)] * axis + [slice(None)] + [slice(None, None, 2)] * (2 - axis)
-
-        def at(along: slice, row: list[slice] = row, axis: int = axis) -> tuple[slice, ...]:
-            return (*row[:axis], along, *row[axis + 1 :])
-
-        odd, behind = at(slice(1, None, 2)), at(slice(2, None, 2))
-        before = at(slice(0, winding.shape[axis] // 2 * 2, 2))
-        weight = known[before].astype(np.float64)
-        total = winding[before] * weight
-        inner = tuple(slice(n) for n in known[behind].shape)  # the last may have none behind it
-        weight[inner] += known[behind]
-        total[inner] += winding[behind] * known[behind]
-        fresh = allowed[odd] & ~known[odd] & (weight > 0)
-        winding[odd][fresh], known[odd][fresh] = total[fresh] / weight[fresh], True
 
 
 def _bodies(points: np.ndarray, shell: np.ndarray) -> Triangles:
@@ -136,10 +114,8 @@ def _bodies(points: np.ndarray, shell: np.ndarray) -> Triangles:
     return closed
 
 
-# Any furniture mesh as one closed solid in the same box.
-#
-# Closed parts are kept as they are (solids.py): wound outward, flat holes capped, and united where
-# there are several, so that no walls stand inside walls. Everything else is wrapped (wrap.py).
+# Any furniture mesh as one closed solid in the same box: closed parts are kept as they are
+# (`solid`), everything else is wrapped (`wrap`).
 
 
 LARGE, LIGHT = 20_000, 10_000  # faces of an open mesh that is made lighter, and what is left

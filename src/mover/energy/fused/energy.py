@@ -22,7 +22,6 @@ from mover.energy.objective import (
     active_config,
     energy_of_terms,
 )
-from mover.geometry.raster import engine
 
 
 @runtime_checkable
@@ -95,7 +94,7 @@ def fused_energy(known: SceneEvidence, config: SceneConfig) -> FusedEnergy | Non
 
     It can on a CPU in single precision, for the robust form and closed meshes.
     """
-    if engine() != "warp" or config.form != "robust" or not _plain(known):
+    if config.form != "robust" or not _plain(known):
         return None
     touches = known.humans.touches
     once = touches is None or len(touches.object_of.unique()) == len(touches.object_of)

@@ -3,15 +3,11 @@
 The grid of a window has its first pixel centre at (0.5, 0.5). Triangles with a vertex nearer than
 `camera.NEAR` are not drawn. The work is done by kernels in NVIDIA Warp on the CPU (vertices on a
 GPU are copied there, the maps back), in single precision whatever that of the vertices, with
-gradients in closed form but none of the intrinsics. Two runs give the same bits. Inside `drawn_by`
-a reference draws instead.
+gradients in closed form but none of the intrinsics. Two runs give the same bits.
 """
 
-from collections.abc import Generator
-from contextlib import contextmanager
-from contextvars import ContextVar
 from types import ModuleType
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -23,41 +19,16 @@ from mover.geometry.raster.records import Crops, Depths, Layers, Maps, Topology
 from mover.geometry.warp_start import kernels, launch, name_of, started
 
 __all__ = [
-    "Crops",
-    "Depths",
-    "Layers",
-    "Topology",
-    "depths",
-    "drawn_by",
-    "engine",
-    "first_hit",
-    "layers",
-    "look",
-    "silhouettes",
-]
+    "Crops", "Depths", "Layers", "Topology",
+    "depths", "first_hit", "layers", "look", "silhouettes",
+]  # fmt: skip
 
 MOST = 1 << 30  # pixels or vertices of one drawing: the kernels count them in 32 bits
-_reference: ContextVar[ModuleType | None] = ContextVar("reference", default=None)
-
-
-def engine() -> Literal["torch", "warp"]:
-    """Who draws and sums: "torch" inside `drawn_by`, else "warp"."""
-    return "torch" if _reference.get() else "warp"
-
-
-@contextmanager
-def drawn_by(module: ModuleType) -> Generator[None, None, None]:
-    """Let a module with `look`, `depths`, `layers` and `first_hit` draw inside the block."""
-    token = _reference.set(module)
-    try:
-        yield
-    finally:
-        _reference.reset(token)
 
 
 def _reference_of(_verts_cam: Tensor) -> ModuleType | None:
-    """Who draws such vertices in place of the kernels."""
-    return _reference.get()
+    """What draws such vertices in place of the kernels: plain torch in tests."""
+    return None
 
 
 def silhouettes(
