@@ -8,7 +8,6 @@ import torch
 from mover.bodies.keypoints import LAYOUTS, keypoints_of, spots_of
 from mover.bodies.skeleton import BODY
 from mover.bodies.skinning import SkinnedBody, open_body, zero_pose
-from mover.bodies.smpl_model import Model
 from mover.core.types import Bodies, BodyPose, Camera, Keypoints
 from mover.geometry.camera import project, tilted
 from mover.geometry.rotations import rot_y
@@ -80,11 +79,11 @@ def leg_columns(layout="openpose25") -> list[int]:
     return [k for k, n in enumerate(LAYOUTS[layout]) if any(part in n for part in legs)]
 
 
-def rest_pose(bodies: int, model: Model) -> BodyPose:
+def rest_pose(bodies: int, model: SkinnedBody) -> BodyPose:
     """So many people of the mean shape (ten numbers) in the zero pose, `transl` zero."""
-    if isinstance(model, SkinnedBody):
+    if model.pose_dirs is None:
         return zero_pose(bodies, model)
-    zero = zero_pose(bodies, model.skin)
+    zero = zero_pose(bodies, model)
     return replace(zero, gender=model.gender, betas=zero.betas[:, :10].clone())
 
 

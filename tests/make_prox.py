@@ -16,8 +16,8 @@ from make_smpl import make_model, write_npz
 from PIL import Image
 
 from mover.bodies.keypoints import keypoints_of
+from mover.bodies.skinning import SkinnedBody
 from mover.bodies.smpl_files import load_smpl
-from mover.bodies.smpl_model import SmplBody
 from mover.core.records import rows_of
 from mover.core.types import BodyPose
 from mover.geometry.camera import project
@@ -34,7 +34,7 @@ def write_body_model(folder: Path) -> Path:
     return folder
 
 
-def smplx_people(room: KnownRoom, rows: list[int], model: SmplBody) -> BodyPose:
+def smplx_people(room: KnownRoom, rows: list[int], model: SkinnedBody) -> BodyPose:
     """Some rows of the people, the pelvis where it was; hands at rest."""
     given = rows_of(room.bodies, torch.tensor(rows))
     assert given.pose is not None

@@ -12,9 +12,8 @@ from make_keypoints import CAMERA, as_bodies, keypoints_at, leg_columns, seen, w
 from make_smpl import make_model, write_npz
 
 from mover.bodies.keypoints import LAYOUTS, keypoints_of
-from mover.bodies.skinning import open_body, shaped, zero_pose
+from mover.bodies.skinning import heights_of, open_body, shaped, zero_pose
 from mover.bodies.smpl_files import load_smpl
-from mover.bodies.smpl_model import heights_of
 from mover.core.errors import InputError
 from mover.core.types import Scene
 from mover.energy.body_energy import BODY_TERMS

@@ -7,8 +7,7 @@ import pytest
 import torch
 from make_keypoints import CAMERA, as_bodies, seen, walker
 
-from mover.bodies.skinning import open_body
-from mover.bodies.smpl_model import growth_of
+from mover.bodies.skinning import growth_of, open_body
 from mover.evaluate.bodies import procrustes
 from mover.fitting.bodies import FitInputs, fit_bodies
 from mover.fitting.config import STAGES, FitConfig, Stage

@@ -12,8 +12,8 @@ from mover.bodies import BODY_MODELS, BodyModel, load_model
 from mover.bodies.parts import members, parts_of
 from mover.bodies.skeleton import JOINTS, PARENTS
 from mover.bodies.skin import PARTS
+from mover.bodies.skinning import FLAT, vertex_subset
 from mover.bodies.smpl_files import FOLDER, find_file, load_smpl
-from mover.bodies.smpl_model import FLAT
 from mover.core.errors import InputError
 from mover.core.records import map_tensors
 from mover.core.types import Bodies, BodyPose
@@ -175,7 +175,7 @@ def test_files_of_version_1_1_have_300_numbers_of_shape_and_100_of_expression(tm
     source = make_model("smplx", "1.1")
     path = write_npz(source, tmp_path / "SMPLX_NEUTRAL.npz")
     model = load_smpl("smplx", place=path)
-    assert model.skin.shape_dirs.shape == (10475, 3, 300)
+    assert model.shape_dirs.shape == (10475, 3, 300)
     assert model.expression_dirs.shape == (10475, 3, 100)
     pose = replace(rest_pose(1, model), extra={FLAT: torch.ones(1, 1)})
     smiling = replace(pose, extra={**pose.extra, "expression": torch.ones(1, 100)})
@@ -205,14 +205,14 @@ def test_models_keep_the_protocol_and_are_found_by_the_environment(folder, name,
 
 
 def test_the_skeletons_are_cut_from_that_of_smplx(folder):
-    assert load_smpl("smplx", place=folder).skin.parents == PARENTS
+    assert load_smpl("smplx", place=folder).parents == PARENTS
     hands = load_smpl("smplh", place=folder)
     named = {n: JOINTS[PARENTS[k]] for k, n in enumerate(JOINTS)}
-    for joint, parent in enumerate(hands.skin.parents[1:], start=1):
+    for joint, parent in enumerate(hands.parents[1:], start=1):
         assert hands.joint_names[parent] == named[hands.joint_names[joint]]
     body = load_smpl("smpl", place=folder)
     assert body.joint_names[22:] == ("left_hand", "right_hand")
-    assert body.skin.parents[22:] == (20, 21)
+    assert body.parents[22:] == (20, 21)
 
 
 def test_turning_the_root_turns_about_the_pelvis_of_that_shape(folder):
@@ -231,14 +231,7 @@ def test_gradients_reach_every_parameter(folder):
         lambda x: x.double() if x.is_floating_point() else x, load_smpl("smplx", place=folder)
     )
     some = torch.arange(0, 10475, 2500)
-    tiny = replace(
-        model,
-        skin=replace(
-            model.skin, verts=model.skin.verts[some], weights=model.skin.weights[some],
-            shape_dirs=model.skin.shape_dirs[some],
-        ),
-        pose_dirs=model.pose_dirs[:, some], expression_dirs=model.expression_dirs[some],
-    )  # fmt: skip
+    tiny = vertex_subset(model, some)
     start = map_tensors(torch.Tensor.double, random_pose(model, 1))
 
     def posed(betas, face, hand, body):
@@ -259,7 +252,8 @@ def test_hands_that_are_not_given_rest_at_the_mean_and_flat_ones_are_flat(arrays
     same = model.posed(replace(rest, extra=given))[0]
     torch.testing.assert_close(model.posed(rest)[0], same, atol=1e-6, rtol=0)
     straight = model.posed(replace(rest, extra={FLAT: flat}))[0]
-    expected = model.skin.posed(rest)[0]  # no correctives in the zero pose
+    plain = replace(model, pose_dirs=None, hands=None)  # no correctives in the zero pose
+    expected = plain.posed(rest)[0]
     torch.testing.assert_close(straight, expected, atol=1e-6, rtol=0)
 
 

@@ -59,7 +59,7 @@ def matrix_file(models, folder):
     """The nearest three vertices in the T-pose; columns behind them act on normals."""
     from scipy.spatial import KDTree
 
-    first, second = (models[n].skin.verts.numpy() for n in ("smpl", "smplx"))
+    first, second = (models[n].verts.numpy() for n in ("smpl", "smplx"))
     far, near = KDTree(first).query(second, k=3)
     share = 1 / (far + 1e-4)
     rows = np.repeat(np.arange(len(second)), 3)

@@ -20,7 +20,7 @@ from mover.bodies.keypoints import keypoints_of
 from mover.bodies.parts import BodyParts, members, parts_of
 from mover.bodies.posture import postures
 from mover.bodies.skinning import open_body
-from mover.bodies.smpl_model import heights_of
+from mover.bodies.skinning import heights_of
 from mover.core.errors import InputError
 from mover.core.files import replacing
 from mover.core.observe import Observer, Step, silent

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from mover.bodies.skinning import open_body
-from mover.bodies.smpl_model import heights_of
+from mover.bodies.skinning import heights_of, open_body
 from mover.core.errors import InputError
 from mover.core.files import replacing
 from mover.core.observe import Observer, Step, silent

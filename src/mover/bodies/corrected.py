@@ -9,8 +9,7 @@ from torch import Tensor
 
 from mover.bodies import BodyModel, load_model
 from mover.bodies.skeleton import BODY
-from mover.bodies.skinning import shaped
-from mover.bodies.smpl_model import growth_of, skin_of_model, vertex_subset
+from mover.bodies.skinning import SkinnedBody, growth_of, shaped, vertex_subset
 from mover.core.errors import InputError
 from mover.core.records import map_tensors, record, rows_of
 from mover.core.types import Bodies, BodyPose, Camera
@@ -150,11 +149,12 @@ def larger(bodies: Bodies, factor: Float[Tensor, " bodies"]) -> Bodies:
         model = load_model(pose.model, pose.gender)
     except InputError:
         return meshes
-    skin, betas, wide = skin_of_model(model), pose.betas, factor.to(pose.betas)[:, None]
-    assert skin is not None
+    if not isinstance(model, SkinnedBody):
+        return meshes
+    betas, wide = pose.betas, factor.to(pose.betas)[:, None]
     growth = growth_of(model)[: betas.shape[1]].to(betas)
     grown = betas + wide.log() * growth / growth.square().sum()
-    before, after = (shaped(skin, some)[1][:, 0].to(pose.transl) for some in (betas, grown))
+    before, after = (shaped(model, some)[1][:, 0].to(pose.transl) for some in (betas, grown))
     pose = dataclasses.replace(pose, betas=grown, transl=wide * (pose.transl + before) - after)
     none = (torch.zeros_like(x) for x in (pose.transl, pose.transl, pose.body_pose))
     return corrected(dataclasses.replace(bodies, pose=pose), Correction(*none))

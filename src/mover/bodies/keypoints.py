@@ -12,7 +12,6 @@ from torch import Tensor
 from mover.bodies import BodyModel
 from mover.bodies.skeleton import FINGERS, SIDES
 from mover.bodies.skinning import SkinnedBody
-from mover.bodies.smpl_model import SmplBody, skin_of_model
 from mover.core.records import record
 
 TIPS = tuple(f"{side}_{finger}_tip" for side in SIDES for finger in FINGERS)
@@ -139,9 +138,8 @@ def spots_of(model: BodyModel, layout: str) -> Spots:
     vertex, share = torch.zeros(len(names), 3, dtype=torch.long), torch.zeros(len(names), 3)
     joint = torch.full((len(names),), -1)
     known = {name: k for k, name in enumerate(model.joint_names)}
-    skin = skin_of_model(model)
-    marks = {} if skin is None else marks_of(skin)
-    face = model.face if isinstance(model, SmplBody) else None
+    marks = marks_of(model) if isinstance(model, SkinnedBody) else {}
+    face = model.face if isinstance(model, SkinnedBody) else None
     for k, name in enumerate(names):
         point = int(name[5:]) - 17 if name.startswith("face_") else -1
         if name in known:

@@ -16,9 +16,14 @@ from torch import Tensor
 
 from mover.bodies.skeleton import BODY
 from mover.bodies.skin import LANDMARKS, PARTS, landmark_rings, lowest_soles, model_parts
-from mover.bodies.skinning import ASSETS, SkinnedBody, open_body, zero_pose
+from mover.bodies.skinning import (
+    ASSETS,
+    SkinnedBody,
+    open_body,
+    vertex_subset,
+    zero_pose,
+)
 from mover.bodies.smpl_files import KINDS, load_smpl
-from mover.bodies.smpl_model import skin_of_model, vertex_subset
 from mover.bodies.transfer import solved
 from mover.core.errors import InputError
 from mover.core.records import record
@@ -140,11 +145,11 @@ def _users_model(bodies: Bodies) -> SkinnedBody | None:
     count = bodies.verts.shape[1]
     for name, gender in [*named, *((n, "neutral") for n, k in KINDS.items() if k.verts == count)]:
         try:
-            skin = skin_of_model(load_smpl(name, gender)) if name in KINDS else None
+            model = load_smpl(name, gender) if name in KINDS else None
         except InputError:
             continue
-        if skin is not None and torch.equal(skin.faces, bodies.faces.cpu()):
-            return skin
+        if model is not None and torch.equal(model.faces, bodies.faces.cpu()):
+            return model
     return None
 
 

@@ -1,4 +1,11 @@
-"""Linear blend skinning: from shape and pose to vertices and joints, batched, differentiable."""
+r"""Skinned bodies: from shape and pose to vertices and joints, batched, differentiable.
+
+    T(β, ψ, θ) = template + shape(β) + expression(ψ) + correctives · (R(θ) - 1),
+    M(β, ψ, θ) = skinned(T, J(template + shape + expression), θ) + transl
+
+after Loper et al. 2015 (Eq. 2 to 10), Romero et al. 2017 and Pavlakos et al. 2019 (Sec. 3.1); the
+open body has neither expression nor correctives. Written from the papers; no SMPL file is shipped.
+"""
 
 import dataclasses
 from functools import cache, lru_cache
@@ -11,12 +18,33 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mover.core.errors import InputError
-from mover.core.records import record
+from mover.core.records import record, rows_of
 from mover.core.types import BodyPose
 from mover.geometry.rotations import axis_angle
 
 ASSETS = Path(__file__).parent / "assets"
 AT_ONCE = 8  # bodies that are skinned together: what fits a processor's cache
+HAND_POSES = ("left_hand_pose", "right_hand_pose")
+FLAT = "flat_hand_mean"
+"""Key of `BodyPose.extra`: not zero where hands are turned from flat, not from the mean hand."""
+
+
+@record
+class Hands:
+    """The space of hand poses; the first axis is left, right."""
+
+    mean: Float[Tensor, "2 45"]
+    """Axis-angle vectors of a relaxed hand [rad]."""
+    components: Float[Tensor, "2 components 45"]
+    """Principal components of hand poses, one a row [rad]."""
+
+
+@record
+class FacePoints:
+    """The 51 inner points of the face, on triangles of the skin."""
+
+    vertex: Int[Tensor, "points 3"]
+    share: Float[Tensor, "points 3"]
 
 
 @record
@@ -41,24 +69,118 @@ class SkinnedBody:
     tpose: Float[Tensor, "joints 3 3"]
     """Turns the parts of the rest shape, bone by bone, into the zero pose."""
 
+    pose_dirs: Float[Tensor, "features verts 3"] | None = None
+    """Displacement for each number of the rotations less identity, joint by joint [m]."""
+    expression_dirs: Float[Tensor, "verts 3 expression"] | None = None
+    """Displacement for one unit of each coefficient of the expression [m]."""
+    expression_joint_dirs: Float[Tensor, "joints 3 expression"] | None = None
+    """The same for the joints [m]."""
+    hands: Hands | None = None
+    face: FacePoints | None = None
+    gender: str = "neutral"
+
     def posed(
         self, pose: BodyPose
     ) -> tuple[Float[Tensor, "bodies verts 3"], Float[Tensor, "bodies joints 3"]]:
-        """Vertices and joints of people in these poses [m], in the frame of `pose.transl`.
+        """Vertices and joints of people in these poses [m], as the smplx package gives them.
+
+        Hands may be 45 angles or fewer principal components; both are added to the mean hand
+        unless `pose.extra["flat_hand_mean"]` says that the hands are turned from flat ones.
 
         Raises:
-            InputError: If the numbers of shape coefficients or angles are not this model's.
+            InputError: If the numbers of coefficients or angles are not this model's.
         """
-        turns = axis_angle(angles_of(self, pose))
-        verts, joints = shaped(self, pose.betas)
+        turns = axis_angle(angles_of(self, with_full_hands(self, pose)))
+        verts, joints = self.rest(turns, pose.betas, pose.extra.get("expression"))
         return skinned(self, turns, verts, joints, pose.transl)
+
+    def rest(
+        self,
+        turns: Float[Tensor, "bodies joints 3 3"],
+        betas: Float[Tensor, "bodies shape"],
+        face: Float[Tensor, "bodies expression"] | None,
+    ) -> tuple[Float[Tensor, "bodies verts 3"], Float[Tensor, "bodies joints 3"]]:
+        """Rest shape and joints with the correctives of pose and expression [m].
+
+        Raises:
+            InputError: If there are more coefficients than the model knows.
+        """
+        verts, joints = shaped(self, betas)
+        most = 0 if self.expression_dirs is None else self.expression_dirs.shape[-1]
+        if face is not None and self.expression_dirs is not None and most:
+            assert self.expression_joint_dirs is not None
+            count = face.shape[-1]
+            if count > most:
+                found = f"has {count} columns, the model '{self.name}' knows {most}"
+                raise InputError(f"'expression' {found}")
+            dirs = self.expression_dirs[..., :count].to(verts)
+            verts = verts + torch.einsum("vik,bk->bvi", dirs, face.to(verts))
+            dirs = self.expression_joint_dirs[..., :count].to(verts)
+            joints = joints + torch.einsum("jik,bk->bji", dirs, face.to(verts))
+        if self.pose_dirs is None:
+            return verts, joints
+        features = (turns[:, 1:] - torch.eye(3).to(turns)).flatten(1)
+        moved = features @ self.pose_dirs.to(verts).flatten(1)
+        return verts + moved.reshape(verts.shape), joints
 
     def joints_in(self, pose: BodyPose) -> Float[Tensor, "bodies joints 3"]:
         """The joints that `posed` finds, without the skin [m]."""
-        bones = dataclasses.replace(
-            self, verts=self.verts[:1], weights=self.weights[:1], shape_dirs=self.shape_dirs[:1]
-        )
-        return bones.posed(pose)[1]
+        return vertex_subset(self, torch.zeros(1, dtype=torch.long)).posed(pose)[1]
+
+
+def vertex_subset(model: object, index: Int[Tensor, " picked"]) -> SkinnedBody:
+    """The model with these vertices only, and without faces; its joints and poses are the same.
+
+    Raises:
+        ValueError: If it is no skinned model.
+    """
+    if not isinstance(model, SkinnedBody):
+        raise ValueError(f"vertex_subset: {type(model).__name__} is no skinned body model")
+    some = rows_of(model, index, "verts")
+    return dataclasses.replace(some, faces=model.faces[:0], face=None)
+
+
+def heights_of(model: object) -> tuple[float, Float[Tensor, " shape"]]:
+    """Height of the mean shape, and what each number of the shape adds to it [m]."""
+    assert isinstance(model, SkinnedBody)
+    y = model.verts[:, 1]
+    top, sole = int(y.argmax()), int(y.argmin())
+    dirs = model.shape_dirs[top, 1] - model.shape_dirs[sole, 1]
+    return float(y[top] - y[sole]), dirs.float()
+
+
+def growth_of(model: SkinnedBody) -> Float[Tensor, " shape"]:
+    """What each number of the shape adds to the logarithm of a body's height."""
+    usual, dirs = heights_of(model)
+    return dirs / usual
+
+
+def with_full_hands(model: SkinnedBody, pose: BodyPose) -> BodyPose:
+    """The same pose with hands as 45 angles each, the mean hand added; SMPL's palms stay straight.
+
+    Raises:
+        InputError: If there are more components than the model has.
+    """
+    body = pose.body_pose
+    if model.name == "smpl" and body.shape[-1] == 63:
+        body = torch.cat([body, body.new_zeros(len(body), 6)], -1)
+    if model.hands is None:
+        return dataclasses.replace(pose, body_pose=body)
+    bodies = pose.global_orient.shape[0]
+    flat = pose.extra.get(FLAT)
+    added = 1.0 if flat is None else (flat == 0).to(body).reshape(-1, 1)
+    full: dict[str, Tensor] = {}
+    for side, name in enumerate(HAND_POSES):
+        given = pose.extra.get(name)
+        angles = body.new_zeros(bodies, 45) if given is None else given
+        if angles.shape[-1] != 45:
+            components = model.hands.components[side].to(body)
+            if angles.shape[-1] > len(components):
+                most = f"the model '{model.name}' knows {len(components)} or 45 angles"
+                raise InputError(f"'{name}' has {angles.shape[-1]} columns, {most}")
+            angles = angles.to(body) @ components[: angles.shape[-1]]
+        full[name] = angles.to(body) + added * model.hands.mean[side].to(body)
+    return dataclasses.replace(pose, body_pose=body, extra={**pose.extra, **full})
 
 
 def skinned(
@@ -190,21 +312,22 @@ def open_body(detail: Literal["small", "full"] = "small") -> SkinnedBody:
     name = {"small": "open_body_small.npz", "full": "open_body.npz"}[detail]
     with np.load(ASSETS / name, allow_pickle=False) as data:
         count = len(data["joints"])
-        arrays = {k: torch.from_numpy(data[k].astype(np.float32)) for k in _ARRAYS}
+        names = ("verts", "joints", "shape_dirs", "joint_dirs", "tpose", "weight")
+        array = {name: torch.from_numpy(data[name].astype(np.float32)) for name in names}
         index = torch.from_numpy(data["weight_joint"].astype(np.int64))
-        share = torch.from_numpy(data["weight"].astype(np.float32))
-        weights = torch.zeros(len(index), count).scatter_add(1, index, share)
+        weights = torch.zeros(len(index), count).scatter_add(1, index, array["weight"])
         return SkinnedBody(
             name="makehuman",
             faces=torch.from_numpy(data["faces"].astype(np.int64)),
             joint_names=tuple(str(n) for n in data["joint_names"]),
             parents=tuple(int(p) for p in data["parents"]),
             weights=weights / weights.sum(1, keepdim=True),
-            **arrays,
+            verts=array["verts"],
+            joints=array["joints"],
+            shape_dirs=array["shape_dirs"],
+            joint_dirs=array["joint_dirs"],
+            tpose=array["tpose"],
         )
-
-
-_ARRAYS = ("verts", "joints", "shape_dirs", "joint_dirs", "tpose")
 
 
 def zero_pose(bodies: int, model: SkinnedBody) -> BodyPose:

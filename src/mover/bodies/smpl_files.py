@@ -13,8 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from mover.bodies.skeleton import BODY, HANDS, JOINTS, PARENTS
-from mover.bodies.skinning import SkinnedBody
-from mover.bodies.smpl_model import FacePoints, Hands, SmplBody
+from mover.bodies.skinning import FacePoints, Hands, SkinnedBody
 from mover.core.errors import InputError
 from mover.core.pickles import load_plain
 from mover.core.records import BROKEN
@@ -49,7 +48,7 @@ def keys_of(name: str) -> tuple[str, ...]:
     return (*NEEDED, *(HAND_KEYS if KINDS[name].hands else ()))
 
 
-def body_from(arrays: Mapping[str, Any], name: str, gender: str, file: str) -> SmplBody:
+def body_from(arrays: Mapping[str, Any], name: str, gender: str, file: str) -> SkinnedBody:
     """The body model in the arrays of a file.
 
     Raises:
@@ -67,7 +66,7 @@ def body_from(arrays: Mapping[str, Any], name: str, gender: str, file: str) -> S
     shape, expression = _split(dirs, name, file)
     faces = _indices(arrays, "f", (None, 3), verts, file)
     at_joints = (regressor @ dirs.reshape(verts, -1)).reshape(joints, 3, -1)
-    skin = SkinnedBody(
+    return SkinnedBody(
         name=name,
         faces=torch.from_numpy(faces),
         joint_names=kind.joints,
@@ -78,9 +77,6 @@ def body_from(arrays: Mapping[str, Any], name: str, gender: str, file: str) -> S
         shape_dirs=_tensor(dirs[..., shape]),
         joint_dirs=_tensor(at_joints[..., shape]),
         tpose=torch.eye(3).expand(joints, 3, 3).clone(),
-    )
-    return SmplBody(
-        skin=skin,
         pose_dirs=_tensor(poses.transpose(2, 0, 1)),
         expression_dirs=_tensor(dirs[..., expression]),
         expression_joint_dirs=_tensor(at_joints[..., expression]),
@@ -217,7 +213,7 @@ OFFICIAL = {
 """Names that SMPL's own downloads have."""
 
 
-def load_smpl(name: str, gender: str = "neutral", place: Path | None = None) -> SmplBody:
+def load_smpl(name: str, gender: str = "neutral", place: Path | None = None) -> SkinnedBody:
     """A body of the SMPL family from the user's file.
 
     Args:
@@ -271,7 +267,7 @@ def _names(name: str, gender: str) -> list[str]:
 
 
 @lru_cache(maxsize=4)
-def _read(path: Path, name: str, gender: str, _changed: int) -> SmplBody:
+def _read(path: Path, name: str, gender: str, _changed: int) -> SkinnedBody:
     """The model in a file; read again when the file changes."""
     if path.suffix == ".npz":
         arrays: dict[str, Any] = _npz(path, name)

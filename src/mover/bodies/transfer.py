@@ -18,8 +18,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from mover.bodies.skinning import FLAT, SkinnedBody, vertex_subset
 from mover.bodies.smpl_files import FOLDER, KINDS
-from mover.bodies.smpl_model import FLAT, SmplBody, vertex_subset
 from mover.core.errors import InputError
 from mover.core.pickles import load_plain
 from mover.core.records import BROKEN, record
@@ -109,7 +109,9 @@ def _valid(path: Path, rows: int) -> Int[Tensor, " valid"]:
     return torch.from_numpy(np.unique(ids.astype(np.int64)))
 
 
-def as_smplx(pose: BodyPose, smpl: SmplBody, smplx: SmplBody, matrix: TransferMatrix) -> BodyPose:
+def as_smplx(
+    pose: BodyPose, smpl: SkinnedBody, smplx: SkinnedBody, matrix: TransferMatrix
+) -> BodyPose:
     """The same people with the parameters of SMPL-X; rows with equal shape stay one person."""
     with torch.no_grad():
         verts, _ = vertex_subset(smpl, matrix.source).posed(pose)

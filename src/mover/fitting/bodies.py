@@ -8,8 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mover.bodies import BodyModel
-from mover.bodies.skinning import shaped, widths_of
-from mover.bodies.smpl_model import FLAT, Model, SmplBody, growth_of, skin_of_model
+from mover.bodies.skinning import FLAT, SkinnedBody, growth_of, shaped, widths_of
 from mover.core.observe import Energy, Observer, Step, silent
 from mover.core.records import record, rows_of
 from mover.core.types import Bodies, BodyPose, Camera, Keypoints
@@ -51,7 +50,7 @@ class FitInputs:
     keypoints: Keypoints
     camera: Camera
     """The true lens; its rotation is the first guess of upright."""
-    model: Model
+    model: SkinnedBody
     start: Bodies | None = None
     """Bodies of another tool in the camera frame, with parameters."""
     prior: PosePrior = ANGLES
@@ -109,16 +108,17 @@ def fit_bodies(
 
 
 def _widened(
-    rows: int, people: int, rig: Rig, model: Model, config: FitConfig
+    rows: int, people: int, rig: Rig, model: SkinnedBody, config: FitConfig
 ) -> dict[str, Tensor]:
     """Shapes of all people, and hands and faces where they are seen and the model has them."""
-    skin = rig.skin
+    skin = rig.model
     hands, face = 0, 0
     if len(skin.parents) > 24 and any("index" in name for name in rig.names):
-        space = getattr(model, "hands", None)
+        space = model.hands
         hands = HAND if space is None else min(HANDS, space.components.shape[1])
     if len(skin.parents) == 55 and any(n.startswith("face_") for n in rig.names):
-        face = 3 + min(EXPRESSION, getattr(model, "expression_dirs").shape[-1])  # noqa: B009
+        assert model.expression_dirs is not None
+        face = 3 + min(EXPRESSION, model.expression_dirs.shape[-1])
     return {
         "betas": torch.zeros(people, min(SHAPES, skin.shape_dirs.shape[-1])),
         "hands": torch.zeros(rows, 2 * hands),
@@ -127,7 +127,7 @@ def _widened(
     }
 
 
-def _on_a_floor(state: FitState, model: Model) -> FitState:
+def _on_a_floor(state: FitState, model: SkinnedBody) -> FitState:
     """With a floor that is sought, first level and below the feet."""
     seen = state.seen
     if not state.config.stands:
@@ -263,19 +263,17 @@ def _speed(state: FitState, keypoints: Keypoints) -> Float[Tensor, "rows joints"
 CHUNK = 128  # rows that are posed at once
 
 
-def pose_of(at: Unknowns, frame: Frame, model: Model) -> BodyPose:
+def pose_of(at: Unknowns, frame: Frame, model: SkinnedBody) -> BodyPose:
     """Parameters of the fitted bodies."""
     angles = frame.prior.decode(at.code)
-    skin = skin_of_model(model)
-    assert skin is not None
-    width = widths_of(skin)["body_pose"]
+    width = widths_of(model)["body_pose"]
     body = torch.cat([angles, angles.new_zeros(len(angles), width - angles.shape[1])], -1)
     betas = at.betas[frame.person]
-    rest = shaped(skin, betas)[1][:, 0]
+    rest = shaped(model, betas)[1][:, 0]
     extra: dict[str, Tensor] = {}
     if at.face.shape[1]:
         extra = {"jaw_pose": at.face[:, :3], "expression": at.face[:, 3:]}
-    if at.face.shape[1] and isinstance(model, SmplBody):
+    if at.face.shape[1] and model.expression_joint_dirs is not None:
         count = at.face.shape[1] - 3
         dirs = model.expression_joint_dirs[0, :, :count].to(rest)
         rest = rest + at.face[:, 3:] @ dirs.mT
@@ -286,7 +284,7 @@ def pose_of(at: Unknowns, frame: Frame, model: Model) -> BodyPose:
         extra[FLAT] = body.new_ones(len(body), 1)
     return BodyPose(
         model=model.name,
-        gender=model.gender if isinstance(model, SmplBody) else "neutral",
+        gender=model.gender,
         betas=betas,
         global_orient=rotation_vectors(turns_of(at, frame)[:, 0]),
         body_pose=body,

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.bodies.skeleton import BODY
-from mover.bodies.smpl_model import Model, skin_of_model
+from mover.bodies.skinning import SkinnedBody
 
 Plane = tuple[Float[Tensor, "3"], Float[Tensor, ""] | float]
 """Away from the floor, in camera axes, and its height along that from the camera [m]."""
@@ -42,11 +42,9 @@ BALANCE = 0.08  # [m], of the centre of mass about the middle of the feet, as on
 NEIGHBOURS = 1.0  # [s], upright frames this close to lying constrain its distance
 
 
-def soles_of(model: Model) -> Float[Tensor, "2"]:
+def soles_of(model: SkinnedBody) -> Float[Tensor, "2"]:
     """Heights of ankle and ball of the foot over the sole of the mean shape [m]."""
-    skin = skin_of_model(model)
-    assert skin is not None
-    return skin.joints[[side[0] for side in FEET], 1] - skin.verts[:, 1].min()
+    return model.joints[[side[0] for side in FEET], 1] - model.verts[:, 1].min()
 
 
 def plane_of(floor: Float[Tensor, " floor"], up: Float[Tensor, "3"], known: float | None) -> Plane:

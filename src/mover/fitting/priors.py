@@ -27,7 +27,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mover.bodies.skeleton import BODY, FINGERS, PARENTS
-from mover.bodies.smpl_model import Model, heights_of
+from mover.bodies.skinning import SkinnedBody, heights_of
 from mover.core.errors import InputError
 from mover.core.records import record
 
@@ -149,7 +149,7 @@ class Stature:
 
 
 def stature_of(
-    model: Model,
+    model: SkinnedBody,
     heights: tuple[float, ...],
     person: Int[Tensor, " bodies"],
     rows: Int[Tensor, " some"],

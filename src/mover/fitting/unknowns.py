@@ -15,8 +15,12 @@ from torch import Tensor
 
 from mover.bodies.keypoints import LAYOUTS, spots_of
 from mover.bodies.skeleton import BODY
-from mover.bodies.skinning import SkinnedBody, pose_joints, shaped, widths_of
-from mover.bodies.smpl_model import Model, SmplBody, skin_of_model, vertex_subset
+from mover.bodies.skinning import (
+    SkinnedBody,
+    pose_joints,
+    vertex_subset,
+    widths_of,
+)
 from mover.core.observe import Energy
 from mover.core.records import record, rows_of
 from mover.fitting.priors import kind_of, spreads
@@ -27,7 +31,7 @@ from mover.geometry.rotations import axis_angle
 class Rig:
     """Joints, keypoint vertices, and how keypoints are mixed of both."""
 
-    model: SkinnedBody | SmplBody
+    model: SkinnedBody
     """The body with its keypoint vertices only; of the open body only the joints that are used."""
     mix: Float[Tensor, "keypoints points"]
     """Share of each joint, then of each vertex, in each keypoint."""
@@ -38,11 +42,6 @@ class Rig:
     bones: Int[Tensor, " keypoints"]
     """The joint whose rotation carries each keypoint: of a joint, its parent."""
 
-    @property
-    def skin(self) -> SkinnedBody:
-        """Rest shape, tree and weights."""
-        return self.model.skin if isinstance(self.model, SmplBody) else self.model
-
 
 @record
 class Points:
@@ -52,7 +51,7 @@ class Points:
     joints: Float[Tensor, "bodies joints 3"]
 
 
-def rig_of(model: Model, layout: str, used: Bool[Tensor, " layout"]) -> Rig:
+def rig_of(model: SkinnedBody, layout: str, used: Bool[Tensor, " layout"]) -> Rig:
     """The rig of the keypoints of a layout that are `used`.
 
     Raises:
@@ -65,20 +64,18 @@ def rig_of(model: Model, layout: str, used: Bool[Tensor, " layout"]) -> Rig:
     needed = torch.unique(vertex[joint < 0])
     small = vertex_subset(model, needed)
     on_body = not any(kind_of(name) == "hand" or "jaw" in name for name in names)
-    if isinstance(small, SkinnedBody) and on_body:
+    if small.pose_dirs is None and on_body:
         small = _of_first_joints(small, len(BODY))
-    skin = skin_of_model(small)
-    assert skin is not None
-    count = len(skin.parents)
+    count = len(small.parents)
     mix = torch.zeros(len(index), count + len(needed))
     is_joint = joint >= 0
     mix[is_joint, joint[is_joint]] = 1
     column = count + torch.searchsorted(needed, vertex)
     rows = torch.nonzero(~is_joint)[:, 0]
     mix[rows] = mix[rows].scatter_add(1, column[rows], share[rows])
-    parents = torch.tensor(skin.parents).clamp_min(0)
+    parents = torch.tensor(small.parents).clamp_min(0)
     first = torch.searchsorted(needed, vertex[:, 0].contiguous()).clamp_max(len(needed) - 1)
-    bones = torch.where(is_joint, parents[joint.clamp_min(0)], skin.weights[first].argmax(1))
+    bones = torch.where(is_joint, parents[joint.clamp_min(0)], small.weights[first].argmax(1))
     return Rig(small, mix, index, names, bones)
 
 
@@ -103,14 +100,11 @@ def move(
 
     `lasting` moves each keypoint in the axes of its bone [m].
     """
-    if isinstance(rig.model, SmplBody):
-        verts, joints = rig.model.rest(turns, betas, expression)
-    else:
-        verts, joints = shaped(rig.skin, betas)
-    world, places = pose_joints(rig.skin, turns, joints)
+    verts, joints = rig.model.rest(turns, betas, expression)
+    world, places = pose_joints(rig.model, turns, joints)
     offset = places - (world @ joints[..., None])[..., 0]
     moves = torch.cat([world, offset[..., None]], -1).flatten(2)
-    skin = (rig.skin.weights.to(moves) @ moves).unflatten(-1, (3, 4))
+    skin = (rig.model.weights.to(moves) @ moves).unflatten(-1, (3, 4))
     moved = (skin[..., :3] @ verts[..., None])[..., 0] + skin[..., 3]
     shift = (pelvis - places[:, 0])[:, None]
     both = torch.cat([places, moved], 1)
@@ -229,12 +223,12 @@ def turns_of(at: Unknowns, frame: Frame) -> Float[Tensor, "bodies joints 3 3"]:
     """Rotations of all joints of the rig; eyes look straight, SMPL's palms are straight."""
     rig, none = frame.rig, at.turn.new_zeros(len(at.turn), 3)
     parts = [frame.prior.decode(at.code)]
-    if len(rig.skin.parents) <= 24:
-        parts += [none] * (len(rig.skin.parents) - 22)
+    if len(rig.model.parents) <= 24:
+        parts += [none] * (len(rig.model.parents) - 22)
     else:
         jaw = at.face[:, :3] if at.face.shape[1] else none
         own = {"jaw_pose": jaw, "leye_pose": none, "reye_pose": none}
-        parts += [own[name] for name in widths_of(rig.skin) if name in own]
+        parts += [own[name] for name in widths_of(rig.model) if name in own]
         parts += [hand_angles(rig, at.hands, side) for side in (0, 1)]
     root = axis_angle(at.turn) @ frame.root
     return torch.cat([root[:, None], axis_angle(torch.cat(parts, -1).unflatten(-1, (-1, 3)))], 1)
@@ -246,7 +240,7 @@ def hand_angles(
     """Angles of a hand from flat [rad]: the mean hand and principal components, or as they are."""
     width = hands.shape[1] // 2
     own = hands[:, side * width : (side + 1) * width]
-    if isinstance(rig.model, SmplBody) and rig.model.hands is not None:
+    if rig.model.hands is not None:
         space = rig.model.hands
         mean = space.mean[side].to(hands).expand(len(hands), -1)
         return mean + own @ space.components[side][:width].to(hands) if width else mean

@@ -107,7 +107,11 @@ def skin_of(pose: BodyPose, bodies: Bodies) -> SkinnedBody | None:
     None if the model is not skinned, has other vertices, or other joints than SMPL-X.
     """
     model = load_model(pose.model, pose.gender)
-    if not isinstance(model, SkinnedBody) or len(model.parents) != 55:
+    if (
+        not isinstance(model, SkinnedBody)
+        or model.pose_dirs is not None
+        or len(model.parents) != 55
+    ):
         return None
     return model if len(model.verts) == bodies.verts.shape[1] else None
 

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mover.bodies import BodyModel, load_model
-from mover.bodies.smpl_model import FLAT, HAND_POSES, SmplBody
+from mover.bodies.skinning import FLAT, HAND_POSES, SkinnedBody
 from mover.core.errors import InputError
 from mover.core.records import record
 from mover.core.types import Bodies, BodyPose
@@ -139,7 +139,7 @@ def _posed_as(model: BodyModel, found: Found) -> BodyPose:
     needed = {name: found.values[name] for name in NEEDED}
     known = ("frame", "person", "K", *NEEDED)
     extra = {name: value for name, value in found.values.items() if name not in known}
-    if isinstance(model, SmplBody) and model.hands is not None and FLAT in extra:
+    if isinstance(model, SkinnedBody) and model.hands is not None and FLAT in extra:
         del extra[FLAT]
         for side, name in enumerate(HAND_POSES):
             if name in extra:

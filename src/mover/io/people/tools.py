@@ -18,7 +18,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mover.bodies.smpl_model import FLAT
+from mover.bodies.skinning import FLAT
 from mover.core.errors import InputError
 from mover.core.types import BodyPose
 from mover.io.capture.pose_file import GENDERS, NEEDED, moved

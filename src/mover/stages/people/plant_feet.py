@@ -22,7 +22,7 @@ from mover.bodies.corrected import Correction, corrected
 from mover.bodies.parts import BodyParts, members
 from mover.bodies.posture import postures
 from mover.bodies.skeleton import BODY
-from mover.bodies.smpl_model import vertex_subset
+from mover.bodies.skinning import vertex_subset
 from mover.core.types import Bodies
 from mover.energy.body_terms import Neighbours, gather_neighbours
 from mover.stages.people.body_evidence import resting_soles
