@@ -220,15 +220,6 @@ def test_bricks_are_busy_where_the_field_changes() -> None:
         assert bool(field.busy[tuple(brick)]) == (field.values[cut].unique().numel() > 1)
 
 
-@pytest.mark.slow
-def test_a_mesh_in_great_pieces_has_the_distances_of_libigl() -> None:
-    """Lists of leaves that are too long, and places inside that begin at the grid's border."""
-    verts, faces = sphere([0.0, 0, 0], 0.5, level=4)
-    whole = grid_around(verts.amin(0), verts.amax(0), cells=120, padding=0.1)
-    part = Volume(whole.values[40:80, 40:80, 40:80], whole.origin + 40 * whole.cell, whole.cell)
-    assert (assert_same(verts[None], faces, part) < 0).all()
-
-
 def test_triangles_without_an_area_change_nothing() -> None:
     one, faces = sphere([0.0, 0, 0], 0.5, level=2)
     a, b = one[faces[0, 0]], one[faces[0, 1]]

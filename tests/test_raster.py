@@ -1,7 +1,6 @@
 """Silhouettes and depth against ray casting, supersampling, analytic cases and differences."""
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ import raster_torch
 import torch
 import trimesh
 from raster_torch_spans import coverage, on_screen, signed_areas, spans
-from raycast import cast, cast_backs, draw
+from raycast import cast, cast_backs
 from reference import use_engine
 
 from mover.geometry.camera import NEAR, tilted
@@ -391,25 +390,3 @@ def test_no_items_give_empty_images():
     none = Topology(shape.faces[:0], shape.edges[:0])
     image, seen = look(verts[:0], none, Crops(PINHOLE[None][:0], 8, 9))
     assert image.shape == seen.covered.shape == (0, 8, 9)
-
-
-class TestRayCaster:
-    def test_sees_both_sides_of_a_slab(self):
-        verts, shape = slab((10.2, 6.2), (22.2, 20.2), 2.0, 2.5, PINHOLE)
-        front, back, face, count = cast(verts, shape.faces[0], PINHOLE, 32, 32)
-        assert front[6:20, 10:22] == pytest.approx(2.0)
-        assert (count[6:20, 10:22] == 2).all()
-        assert back[14, 16] == pytest.approx(2.5)
-        assert (face >= 0).sum() == 12 * 14
-        leave = cast_backs(verts, shape.faces[0], PINHOLE, 32, 32)[0]
-        np.testing.assert_array_equal(leave[face >= 0], back[face >= 0])
-
-    def test_draws_the_nearer_of_two_meshes(self):
-        balls = [trimesh.creation.icosphere(3, r) for r in (0.5, 0.2)]
-        places = ([0, 0, -3], [0.3, 0.1, -2])
-        meshes = [(b.vertices + p, b.faces) for b, p in zip(balls, places, strict=True)]
-        camera = SimpleNamespace(K=PINHOLE, R_cam_world=np.diag([1.0, -1, -1]), width=32, height=32)
-        seen = draw(meshes, camera)
-        assert seen[11, 30] == 1  # right of and above the centre, where the near ball is
-        assert seen[16, 10] == 0
-        assert seen[0, 0] == -1

@@ -24,20 +24,6 @@ def sphere(center: list[float], radius: float, level: int = 4) -> tuple[Tensor, 
     return verts, torch.from_numpy(shape.faces.copy())
 
 
-def naive_winding(points: np.ndarray, verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Solid angles of all triangles over 4 pi (Van Oosterom and Strackee)."""
-    total = np.zeros(len(points))
-    for row in range(0, len(points), 200):
-        corners = verts[faces][None] - points[row : row + 200, None, None]
-        length = np.linalg.norm(corners, axis=-1)
-        a, b, c = np.moveaxis(corners, 2, 0)
-        triple = (np.cross(a, b) * c).sum(-1)
-        below = length.prod(-1) + (a * b).sum(-1) * length[..., 2]
-        below += (b * c).sum(-1) * length[..., 0] + (c * a).sum(-1) * length[..., 1]
-        total[row : row + 200] = np.arctan2(triple, below).sum(-1) / (2 * np.pi)
-    return total
-
-
 def centers(grid: Volume) -> Tensor:
     at = torch.cartesian_prod(*[torch.arange(n) for n in grid.values.shape])
     return at * grid.cell + grid.origin
@@ -136,17 +122,6 @@ def test_ten_posed_bodies_agree_with_exact_distances_and_signs():
         assert torch.equal(values[~near].unique(), grid.values.unique())
     assert total > 50_000
     assert wrong <= 1e-3 * total
-
-
-def test_signs_are_those_of_naive_solid_angles():
-    verts, faces = posed_bodies(1)
-    grid = grid_around(verts[0].amin(0), verts[0].amax(0), cells=40, padding=0.1)
-    values, place = union_bodies(verts, faces, grid).values.flatten(), centers(grid)
-    near = torch.nonzero(values <= 2 * grid.cell)[::23, 0]
-    naive = naive_winding(place[near].double().numpy(), verts[0].double().numpy(), faces.numpy())
-    assert ((naive > 0.5) == (values[near] < 0).numpy()).mean() >= 0.999
-    oracle = signed_distance(place[near], verts[0], faces)
-    assert ((naive > 0.5) == (oracle < 0).numpy()).mean() >= 0.999
 
 
 ROUNDING = 1e-7  # [m]: which of two faces beside an edge is nearest differs by a rounding

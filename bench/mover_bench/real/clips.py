@@ -19,8 +19,7 @@ from mover.app.cli.video import VideoArgs, video_to_room
 from mover.bodies.keypoints import keypoints_of
 from mover.bodies.parts import BodyParts, members, parts_of
 from mover.bodies.posture import postures
-from mover.bodies.skinning import open_body
-from mover.bodies.skinning import heights_of
+from mover.bodies.skinning import heights_of, open_body
 from mover.core.errors import InputError
 from mover.core.files import replacing
 from mover.core.observe import Observer, Step, silent
