@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.bodies.parts import BodyParts, members
+from mover.bodies.skeleton import SIDES
 from mover.bodies.skin import LANDMARKS, PARTS
 from mover.core.records import record
 from mover.core.types import Bodies
@@ -41,7 +42,7 @@ class Postures:
 def landmarks(bodies: Bodies, parts: BodyParts) -> Float[Tensor, "bodies landmarks 3"]:
     """Places of `LANDMARKS` [m]: from the joints by name, else the middle of rings of vertices.
 
-    NaN where a mesh could not be matched to a human body.
+    NaN for a mesh of unknown topology without these joints.
     """
     names = bodies.joint_names
     if bodies.joints is not None and all(name in names for name in LANDMARKS):
@@ -108,9 +109,7 @@ def postures(bodies: Bodies, parts: BodyParts, ground: Height | None = None) -> 
     places = landmarks(bodies, parts)
     floor = bodies.verts[..., 1].amin(1) if ground is None else ground
     hips, trunk = at(places, "hips"), at(places, "neck") - at(places, "hips")
-    thighs = torch.stack(
-        [at(places, f"{s}_knee") - at(places, f"{s}_hip") for s in ("left", "right")], 1
-    )
+    thighs = torch.stack([at(places, f"{s}_knee") - at(places, f"{s}_hip") for s in SIDES], 1)
     level = elevation(thighs).abs().amax(1) < LEVEL_THIGH
     rise = elevation(trunk)
     height = (hips[:, 1] - floor) / _standing_hips(places, bodies)
@@ -129,12 +128,11 @@ def _standing_hips(
     places: Float[Tensor, "bodies landmarks 3"], bodies: Bodies
 ) -> Float[Tensor, " bodies"]:
     """Height of the hips over the ground when the person stands straight [m], one per track."""
-    legs = [
-        (at(places, f"{s}_hip") - at(places, f"{s}_knee")).norm(dim=-1)
-        + (at(places, f"{s}_knee") - at(places, f"{s}_ankle")).norm(dim=-1)
-        for s in ("left", "right")
-    ]
-    leg = (legs[0] + legs[1]) / 2 * (1 + ANKLE)
+    bones = [
+        (at(places, f"{s}_{a}") - at(places, f"{s}_{b}")).norm(dim=-1)
+        for s in SIDES for a, b in (("hip", "knee"), ("knee", "ankle"))
+    ]  # fmt: skip
+    leg = ((bones[0] + bones[1]) + (bones[2] + bones[3])) / 2 * (1 + ANKLE)
     result = leg.clone()
     for person in bodies.person.unique():
         mine = bodies.person == person
@@ -171,10 +169,7 @@ def headings(
 
 FACING = (0.3, 0.7)  # cosine between normal and the direction of touch: never, surely
 RECLINE = (0.12, 0.3)  # [rad] of the trunk behind upright: not leaning, surely leaning
-LAYER = (
-    0.07,
-    0.03,
-)  # [m] from what reaches farthest: a flat surface is not touched, surely touched
+LAYER = (0.07, 0.03)  # [m] from what reaches farthest: not touched by a flat surface, surely so
 PALM = (0.04, 0.015)  # the same for a hand
 STILL = (0.1, 0.3)  # [m/s] of hands: at rest, surely moving
 STANCE = (0.3, 0.8)  # [m/s] of soles, which tremble more and swing faster
@@ -198,12 +193,15 @@ def touching(bodies: Bodies, parts: BodyParts, ground: Height) -> Float[Tensor, 
     places = landmarks(bodies, parts)
     normals = vertex_normals(bodies.verts, bodies.faces)
     down = _ramp(-normals[..., 1], *FACING)
-    chance = _sit(bodies, parts, pose, down)
-    trunk = at(places, "neck") - at(places, "hips")
-    chance = torch.maximum(chance, _recline(bodies, parts, pose, facing(places), trunk, normals))
-    chance = torch.maximum(chance, _lie(bodies, parts, pose, down))
-    chance = torch.maximum(chance, _rest_arms(bodies, parts, places, down, ground))
-    return torch.maximum(chance, _stand(bodies, parts, ground))
+    seat = members(parts, "seat", "left_thigh", "right_thigh")  # what faces down and is low enough
+    chances = [
+        _flat(-bodies.verts[..., 1], down * seat * pose.sitting[:, None], LAYER),
+        _recline(bodies, parts, pose, places, normals),
+        _lie(bodies, parts, pose, down),
+        _rest_arms(bodies, parts, places, down, ground),
+        _stand(bodies, parts, ground),
+    ]
+    return torch.stack(chances).amax(0)
 
 
 def _ramp(value: Tensor, zero: float, one: float) -> Tensor:
@@ -229,23 +227,15 @@ def _flat(
     return chance * _ramp(farthest - reach, *layer)
 
 
-def _sit(
-    bodies: Bodies, parts: BodyParts, pose: Postures, down: Float[Tensor, "bodies verts"]
-) -> Float[Tensor, "bodies verts"]:
-    """Sitting: what faces down of seat and thighs, as far as it is low enough."""
-    part = members(parts, "seat", "left_thigh", "right_thigh")
-    return _flat(-bodies.verts[..., 1], down * part * pose.sitting[:, None], LAYER)
-
-
 def _recline(
     bodies: Bodies,
     parts: BodyParts,
     pose: Postures,
-    front: Float[Tensor, "bodies 3"],
-    trunk: Float[Tensor, "bodies 3"],
+    places: Float[Tensor, "bodies landmarks 3"],
     normals: Float[Tensor, "bodies verts 3"],
 ) -> Float[Tensor, "bodies verts"]:
     """Leaning back in a seat: what faces backwards of the back and reaches far enough."""
+    front, trunk = facing(places), at(places, "neck") - at(places, "hips")
     behind = _ramp(-torch.einsum("bvi,bi->bv", normals, front), *FACING)
     lean = _ramp(pose.recline, *RECLINE) * pose.sitting
     axis = trunk / trunk.norm(dim=-1, keepdim=True).clamp_min(1e-9)
@@ -300,7 +290,7 @@ def from_lap(
 ) -> Float[Tensor, " bodies"]:
     """Distance to the nearer of the own thighs' middle lines [m]."""
     ways: list[Tensor] = []
-    for side in ("left", "right"):
+    for side in SIDES:
         hip, knee = at(places, f"{side}_hip"), at(places, f"{side}_knee")
         thigh = knee - hip
         along = ((point - hip) * thigh).sum(-1) / thigh.square().sum(-1).clamp_min(1e-9)

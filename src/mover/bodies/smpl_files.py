@@ -55,9 +55,8 @@ def body_from(arrays: Mapping[str, Any], name: str, gender: str, file: str) -> S
         InputError: If an array is missing or does not have the model's shape.
     """
     kind = KINDS[name]
-    _check_keys(arrays, name, file)
+    _check_model(arrays, name, file)
     verts, joints = kind.verts, len(kind.joints)
-    _check_size(arrays["v_template"], name, file)
     template = _numbers(arrays, "v_template", (verts, 3), file)
     dirs = _numbers(arrays, "shapedirs", (verts, 3, None), file)
     poses = _numbers(arrays, "posedirs", (verts, 3, 9 * (joints - 1)), file)
@@ -90,27 +89,21 @@ def _tensor(value: Array) -> torch.Tensor:
     return torch.from_numpy(np.ascontiguousarray(value, np.float32))
 
 
-def _check_keys(arrays: Mapping[str, Any], name: str, file: str) -> None:
-    missing = [key for key in keys_of(name) if key not in arrays]
+def _check_model(arrays: Mapping[str, Any], name: str, file: str) -> None:
+    """Refuse a file without the arrays of this model, or with the mesh of another one."""
+    needed = keys_of(name)
+    missing = [key for key in needed if key not in arrays]
     if missing:
         found = ", ".join(sorted(str(key) for key in arrays)[:30]) or "nothing"
         raise InputError(
-            f"{file}: field '{missing[0]}' is missing, expected {', '.join(keys_of(name))} "
+            f"{file}: field '{missing[0]}' is missing, expected {', '.join(needed)} "
             f"for the model '{name}'; found {found}"
         )
-
-
-def _check_size(template: Any, name: str, file: str) -> None:  # noqa: ANN401
-    """Refuse the mesh of another model.
-
-    Raises:
-        InputError: If it has as many vertices as another model.
-    """
-    found = np.shape(template)
-    others = [other for other, kind in KINDS.items() if found == (kind.verts, 3)]
+    shape = np.shape(arrays["v_template"])
+    others = [other for other, kind in KINDS.items() if shape == (kind.verts, 3)]
     if others and name not in others:
         raise InputError(
-            f"{file}: field 'v_template' has {found[0]} vertices, those of {' and '.join(others)}, "
+            f"{file}: field 'v_template' has {shape[0]} vertices, those of {' and '.join(others)}, "
             f"expected {KINDS[name].verts} of '{name}'"
         )
 
@@ -124,25 +117,25 @@ def _numbers(
         InputError: If it is anything else.
     """
     value = arrays[key]
-    if tuple(getattr(value, "shape", ())) and not _fits(value.shape, shape):
-        raise InputError(_wrong(file, key, f"shape {tuple(value.shape)}", shape))
-    array: Array = np.asarray(value.toarray() if hasattr(value, "toarray") else value)
+    if hasattr(value, "toarray") and _fits(value.shape, shape):  # else it may be huge
+        value = value.toarray()
+    array: Array = np.asarray(value)
+    found = ""
     if array.dtype.kind not in "fiu" or not _fits(array.shape, shape):
-        raise InputError(_wrong(file, key, f"shape {array.shape} of {array.dtype}", shape))
-    if not np.isfinite(array).all():
-        raise InputError(_wrong(file, key, "numbers that are not finite", shape))
+        found = f"shape {tuple(getattr(value, 'shape', array.shape))} of {array.dtype}"
+    elif not np.isfinite(array).all():
+        found = "numbers that are not finite"
+    if found:
+        sizes = ", ".join("N" if n is None else str(n) for n in shape)
+        expected = f"expected finite numbers of shape ({sizes})"
+        raise InputError(f"{file}: field '{key}' has {found}, {expected}")
     return array.astype(np.float64)
 
 
 def _fits(found: tuple[int, ...], shape: tuple[int | None, ...]) -> bool:
     return len(found) == len(shape) and all(
-        want is None or have == want for have, want in zip(found, shape, strict=True)
+        want in (None, have) for have, want in zip(found, shape, strict=True)
     )
-
-
-def _wrong(file: str, key: str, found: str, shape: tuple[int | None, ...]) -> str:
-    sizes = ", ".join("N" if n is None else str(n) for n in shape)
-    return f"{file}: field '{key}' has {found}, expected finite numbers of shape ({sizes})"
 
 
 def _indices(

@@ -49,12 +49,9 @@ def find_matrix(folder: Path | None = None) -> Path | None:
 
     Looked for in `folder`, by default the one of `MOVER_BODY_MODELS`, and in its `transfer_data`.
     """
-    if folder is None:
-        given = os.environ.get(FOLDER)
-        if not given:
-            return None
-        folder = Path(given)
-    tried = [folder / FILE, folder / "transfer_data" / FILE, folder / "transfer" / FILE]
+    given = folder or os.environ.get(FOLDER)
+    places = ("", "transfer_data", "transfer") if given else ()
+    tried = (Path(given or "") / place / FILE for place in places)
     return next((path for path in tried if path.is_file()), None)
 
 
@@ -134,11 +131,8 @@ def as_smplx(
         turn = at["turn"].square().mean(-1).sum() / SIGMA_POSE**2
         return miss / SIGMA_VERTEX**2 + turn + at["betas"].square().sum() / SIGMA_SHAPE**2
 
-    at = {
-        "betas": goal.new_zeros(len(shapes), SHAPES),
-        "transl": goal.new_zeros(rows, 3),
-        "turn": torch.zeros_like(angles),
-    }
+    at = {"betas": goal.new_zeros(len(shapes), SHAPES), "transl": goal.new_zeros(rows, 3)}
+    at["turn"] = torch.zeros_like(angles)
     with torch.no_grad():
         at["transl"] = (goal - small.posed(laid(at))[0]).mean(1)
     at = solved(at, ("betas", "transl"), energy, STEPS)
