@@ -22,6 +22,14 @@ def use_engine(name: str) -> Generator[None, None, None]:
         yield
 
 
+@contextmanager
+def use_threads(count: int) -> Generator[None, None, None]:
+    """Let so many threads draw inside the block (or the decorated function)."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("OMP_NUM_THREADS", str(count))
+        yield
+
+
 def reference_of(verts_cam: torch.Tensor) -> ModuleType | None:
     """Torch for double precision, which the kernels do not have and tests of gradients need."""
     return raster_torch if verts_cam.dtype == torch.float64 else None

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from analytic import humans_at, image_at, make_inputs, moved, several, walls_at
-from reference import use_engine
+from reference import use_engine, use_threads
 from test_raster import packed
 
 from mover.core.observe import Energy
@@ -19,7 +19,6 @@ from mover.energy.objective import HumanCues, scene_energy
 from mover.geometry.placement import place
 from mover.geometry.rotations import axis_angle
 from mover.geometry.topology import edges_of
-from mover.geometry.warp_start import use_threads
 from mover.stages.config import PlaceConfig
 from mover.stages.objects.place_objects import place_objects
 

@@ -16,7 +16,6 @@ from mover.core import records
 from mover.core.observe import Step, silent
 from mover.core.run import Run
 from mover.geometry.rle import decode
-from mover.geometry.warp_start import use_threads
 from mover.io.capture.scene_file import read_scene
 from mover.io.formats import read
 from mover.pipeline.presets import PRESETS
@@ -93,7 +92,7 @@ class TestRun:
             if step.stage == "gather_cues: free space":
                 raise Killed
 
-        with pytest.raises(Killed), use_threads(1):  # what is computed beside has no steps
+        with pytest.raises(Killed):
             run_in(tmp_path / "cut", capture, config, die)
         finished = {p.parent.name for p in (tmp_path / "cut" / "stages").rglob("*.json")}
         assert "align_camera" in finished

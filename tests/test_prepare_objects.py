@@ -3,13 +3,13 @@ import pytest
 import torch
 import trimesh
 from analytic import FACES, box_verts
+from reference import use_threads
 
 from mover.core.types import Layout, Mesh, SceneObject
 from mover.furniture.library import BACKS, PIECES, SEATS, make_piece
 from mover.geometry.mesh import box, signed_volume
 from mover.geometry.placement import place, place_object
 from mover.geometry.topology import is_closed
-from mover.geometry.warp_start import use_threads
 from mover.stages.config import PrepareConfig
 from mover.stages.objects.prepare_objects import (
     PrepareInputs,

@@ -7,12 +7,13 @@ import pytest
 import raster_torch
 import torch
 import trimesh
+from reference import use_threads
 from test_raster import PINHOLE, packed, posed, poses, slab, window
 
 from mover.geometry import raster
 from mover.geometry import raster as raster_warp
 from mover.geometry.raster import Crops, Topology
-from mover.geometry.warp_start import _cores, threads, use_threads
+from mover.geometry.warp_start import _cores, threads
 
 wp = pytest.importorskip("warp")
 NAMES = ["sphere", "torus", "chair", "table", "sofa"]

@@ -5,10 +5,11 @@ but releases Python's lock, so bodies are measured in threads, each with a volum
 minimum of these is the result.
 """
 
+import itertools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from queue import SimpleQueue
+from dataclasses import replace
+from threading import Lock
 from typing import Any
 
 import torch
@@ -20,16 +21,6 @@ from mover.geometry.warp_start import array, kernels, launch, name_of, started
 
 REACH = 2  # [cells], that the shell reaches out of the body
 SLIVER = 1e-9  # squared sine of an angle below which a triangle has no area
-
-
-@dataclass(frozen=True)
-class Worker:
-    """What one thread works on."""
-
-    mesh: Any
-    """Warp's mesh, whose vertices and boxes follow the bodies."""
-    field: Tensor
-    """The volume of the bodies that this worker measured."""
 
 
 def union_bodies(
@@ -56,51 +47,51 @@ def union_bodies(
     """
     if len(verts) == 0 or len(faces) == 0:
         return grid
-    device, points = name_of(verts.device), verts.detach().float().contiguous()
-    kernels("bodies", device)  # before there are threads
+    points = verts.detach().float().contiguous()
+    kernels("bodies", name_of(verts.device))  # before there are threads
     corners = faces.to(verts.device, torch.int32).contiguous()
     count = min(max(1, workers), len(verts)) if verts.device.type == "cpu" else 1
-    every, idle = [_worker(points[0], corners, grid) for _ in range(count)], SimpleQueue[Worker]()
-    for worker in every:
-        idle.put(worker)
+    lock, done = Lock(), itertools.count(1)
 
-    def add(body: int) -> None:
-        worker = idle.get()
-        try:
+    def lowered(part: Tensor) -> Tensor:
+        """A volume of its own, lowered by some of the bodies."""
+        mesh = _mesh(points[0], corners)
+        field = grid.values.detach().float().to(verts.device).clone().contiguous()
+        for body in part.tolist():
             if not bool(points[body].isfinite().all()):
                 raise ValueError(f"union_bodies: body {body} has vertices that are not finite")
-            add_body(points[body], corners, grid, worker)
-        finally:
-            idle.put(worker)
+            add_body(points[body], corners, Volume(field, grid.origin, grid.cell), mesh)
+            if observe is not None:
+                with lock:
+                    observe(next(done), len(verts))
+        return field
 
     with ThreadPoolExecutor(count) as pool:
-        for done, _ in enumerate(pool.map(add, range(len(verts))), 1):
-            if observe is not None:
-                observe(done, len(verts))
-    values = torch.stack([w.field for w in every]).amin(0) if count > 1 else every[0].field
-    return replace(grid, values=values.to(grid.values))
+        fields = list(pool.map(lowered, torch.arange(len(verts)).chunk(count)))
+    return replace(grid, values=torch.stack(fields).amin(0).to(grid.values))
 
 
-def _worker(verts: Tensor, corners: Tensor, grid: Volume) -> Worker:
-    """One body's mesh without the triangles that have no area, and a copy of the volume."""
-    wp = started()
+def _mesh(verts: Tensor, corners: Tensor) -> Any:  # noqa: ANN401
+    """Warp's mesh, whose vertices follow the bodies, without the triangles that have no area."""
     a, b, c = verts[corners.long()].unbind(-2)
     square = torch.linalg.cross(b - a, c - a).square().sum(-1)
     flat = square <= SLIVER * (b - a).square().sum(-1) * (c - a).square().sum(-1)
     some = corners if bool(flat.all()) else corners[~flat]
-    mesh = wp.Mesh(array(verts.clone(), "vec3"), array(some.flatten(), "int32"))
-    return Worker(mesh, grid.values.detach().float().to(verts.device).clone().contiguous())
+    return started().Mesh(array(verts.clone(), "vec3"), array(some.flatten(), "int32"))
 
 
 def add_body(
-    verts: Float[Tensor, "verts 3"], corners: Int[Tensor, "faces 3"], grid: Volume, worker: Worker
+    verts: Float[Tensor, "verts 3"],
+    corners: Int[Tensor, "faces 3"],
+    volume: Volume,
+    mesh: Any,  # noqa: ANN401
 ) -> None:
-    """Lower the worker's volume to the signed distance of one body [m]."""
+    """Lower a volume, in place, to the signed distance of one body [m]."""
     from mover.geometry.kernels import bodies
 
     wp, device = started(), verts.device
-    place = (verts.double() - grid.origin.to(device).double()) / grid.cell
-    last = torch.tensor(worker.field.shape) - 1
+    place = (verts.double() - volume.origin.to(device).double()) / volume.cell
+    last = torch.tensor(volume.values.shape) - 1
     low = (place.amin(0).floor().cpu().long() - REACH).clamp_min(0)
     high = torch.minimum(place.amax(0).ceil().cpu().long() + REACH, last)
     if bool((high < low).any()):
@@ -116,8 +107,8 @@ def add_body(
     steps = torch.zeros(*shape[:2], shape[2] + 1, dtype=torch.int32, device=device)
     body.winding = array(steps, "int32")
     at = place.float()
-    wp.copy(worker.mesh.points, array(at, "vec3"))
-    worker.mesh.refit()
-    field = array(worker.field, "float32")
+    wp.copy(mesh.points, array(at, "vec3"))
+    mesh.refit()
+    field = array(volume.values, "float32")
     launch(bodies.cross, len(corners), [body], device)
-    launch(bodies.lower, shape[:2], [body, worker.mesh.id, side, field, grid.cell], device)
+    launch(bodies.lower, shape[:2], [body, mesh.id, side, field, volume.cell], device)

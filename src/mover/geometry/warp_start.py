@@ -5,7 +5,6 @@ import os
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from contextvars import ContextVar
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -20,7 +19,6 @@ A = TypeVar("A")
 B = TypeVar("B")
 KERNELS = "mover.geometry.kernels"
 log = logging.getLogger(KERNELS)
-_threads: ContextVar[int | None] = ContextVar("threads", default=None)
 _lock = RLock()  # of all that is done once; `cache` alone lets two threads do it
 
 
@@ -73,7 +71,7 @@ def launch(
     inputs: list[Any],
     device: torch.device,
 ) -> None:
-    """Launch a kernel where torch works now: on a GPU in its stream, which may be recording."""
+    """Launch a kernel where torch works now: on a GPU in its stream."""
     stream = _stream(torch.cuda.current_stream(device)) if device.type == "cuda" else None
     started().launch(kernel, dim, inputs, device=name_of(device), stream=stream)
 
@@ -116,23 +114,13 @@ def filled(kind: Any, **fields: Any) -> Any:  # noqa: ANN401
 
 
 def threads() -> int:
-    """Threads that draw on a CPU: of `use_threads`, else of OMP_NUM_THREADS, else one a core.
+    """Threads that draw on a CPU: of OMP_NUM_THREADS, else one a core.
 
     They never wait for one another within an item, so that, unlike torch's, they pay for small
     work too.
     """
     asked = os.environ.get("OMP_NUM_THREADS", "")
-    return _threads.get() or (int(asked) if asked.isdigit() and int(asked) else _cores())
-
-
-@contextmanager
-def use_threads(count: int) -> Generator[None, None, None]:
-    """Let so many threads draw inside the block (or the decorated function)."""
-    token = _threads.set(count)
-    try:
-        yield
-    finally:
-        _threads.reset(token)
+    return int(asked) if asked.isdigit() and int(asked) else _cores()
 
 
 @cache

@@ -16,7 +16,6 @@ from torch.autograd.function import once_differentiable
 
 from mover.geometry.raster import draw
 from mover.geometry.raster.records import Crops, Depths, Layers, Maps, Topology
-from mover.geometry.warp_start import kernels, launch, name_of, started
 
 __all__ = [
     "Crops", "Depths", "Layers", "Topology",
@@ -77,26 +76,21 @@ def layers(
 
     `exit` is the nearest back-facing surface. Where a body cuts into itself (a hand in the hip) the
     ray may still be inside another part there: the bound is conservative, never too deep.
-    Items are streamed, so memory does not grow with their number but for the result. A call works
-    in one thread and leaves Python's lock to others.
     """
     if reference := _reference_of(verts_cam):
         return reference.layers(verts_cam, faces, views)
-    wp = started()
-    items, n_verts, _ = verts_cam.shape
-    points = verts_cam.detach().float().contiguous()
-    front = points.new_zeros(items, views.height, views.width)
-    leave = torch.full_like(front, -0.0)  # whose inverse is what stands for no exit
-    if front.numel() * n_verts * len(faces) > 0:
-        window = wp.from_torch(draw.windows(views.K.to(points), 0), dtype=wp.vec4)
-        screen = wp.from_torch(torch.empty_like(points), dtype=wp.vec3)
-        table = wp.from_torch(faces.to(points.device).long().contiguous(), dtype=wp.vec3l)
-        maps = [wp.from_torch(front), wp.from_torch(leave)]
-        exits = kernels("exits", name_of(points.device))
-        verts = wp.from_torch(points, dtype=wp.vec3)
-        launch(exits.project, (items, n_verts), [verts, window, screen], points.device)
-        launch(exits.draw, (items, len(faces)), [screen, table, *maps], points.device)
-    return Layers(front.reciprocal_().to(verts_cam), leave.reciprocal_().to(verts_cam))
+    points = verts_cam.detach().float().cpu()
+    size = (len(points), views.height, views.width)
+    most = max(1, MOST // max(views.height * views.width, points.shape[1], 1))
+    found: list[Tensor] = []
+    for way, none in ((faces, torch.inf), (faces.flip(-1), -torch.inf)):  # backs as fronts
+        shape = Topology(way[None], way.new_zeros(1, 0, 4))
+        depth, face = torch.full(size, none), torch.empty(size, dtype=torch.int32)
+        for k in range(0, len(points) if len(faces) else 0, most):
+            some, part = slice(k, k + most), Crops(views.K[k : k + most], *size[1:])
+            draw.first_hit(points[some], shape, part, depth[some], face[some], draw.NOWHERE)
+        found.append(depth.to(verts_cam))
+    return Layers(*found)
 
 
 def first_hit(
@@ -114,7 +108,8 @@ def first_hit(
     depth, face = torch.full(size, torch.inf), torch.full(size, -1, dtype=torch.int32)
     if len(verts_cam):
         shape, views = Topology(faces[None], faces.new_zeros(1, 0, 4)), Crops(K[None], *size)
-        draw.first_hit(verts_cam.detach().float().cpu()[None], shape, views, depth, face)
+        points = verts_cam.detach().float().cpu()[None]
+        draw.first_hit(points, shape, views, depth, face, draw.FRONT)
     return depth.to(verts_cam), face.long().to(verts_cam.device)
 
 

@@ -39,11 +39,13 @@ def look(
     return maps, Trace(scene, near, far, cuts)
 
 
-def first_hit(verts: Tensor, shape: Topology, views: Crops, depth: Tensor, face: Tensor) -> None:
+def first_hit(
+    verts: Tensor, shape: Topology, views: Crops, depth: Tensor, face: Tensor, backs: int
+) -> None:
     """Write the nearest surface and its face where there is one."""
     none = verts.new_zeros(0)
     packed = _maps(Maps(none, depth, none, none.bool()), face, face)
-    _draw(_scene(verts, shape, views, 0), packed, FRONT)
+    _draw(_scene(verts, shape, views, 0), packed, backs)
 
 
 def pull(maps: Maps, trace: Trace, grads: dict[str, Tensor | None], verts: Tensor) -> None:
