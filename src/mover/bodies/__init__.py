@@ -39,14 +39,8 @@ class BodyModel(Protocol):
         ...
 
 
-def _makehuman(gender: str) -> BodyModel:
-    """The open body; its gender is part of its shape, so `gender` changes nothing."""
-    del gender
-    return open_body()
-
-
 BODY_MODELS: dict[str, Callable[[str], BodyModel]] = {
-    "makehuman": _makehuman,
+    "makehuman": lambda _: open_body(),  # its gender is part of its shape
     "smpl": partial(load_smpl, "smpl"),
     "smplh": partial(load_smpl, "smplh"),
     "smplx": partial(load_smpl, "smplx"),

@@ -35,12 +35,6 @@ class Volume:
     """Edge of a cell [m]."""
 
     @cached_property
-    def corner(self) -> tuple[float, float, float]:
-        """The origin as numbers [m]."""
-        x, y, z = self.origin.tolist()
-        return x, y, z
-
-    @cached_property
     def busy(self) -> UInt8[Tensor, "bx by bz"]:
         """1 for each brick of 8 cells along an axis in which the values change, else 0."""
         low = high = self.values.detach()
@@ -70,7 +64,7 @@ def field_of(volume: Volume, busy: Tensor) -> Any:  # noqa: ANN401
     """The volume as kernels read it: `kernels.lookup.Field`, with what is known of its bricks."""
     from mover.geometry.kernels.lookup import Field
 
-    origin = started().vec3(*volume.corner)
+    origin = started().vec3(*volume.origin.tolist())
     return filled(Field, values=volume.values, busy=busy, origin=origin, cell=volume.cell)
 
 
