@@ -48,7 +48,7 @@ def test_a_folder_of_pictures_becomes_a_capture_and_is_not_read_twice(tmp_path: 
     clip_of(tmp_path / "in")
     out, said = tmp_path / "c", list[str]()
     masks, joints = tiny_mask2former(tmp_path / "masks"), tiny_vitpose(tmp_path / "joints")
-    models = ModelsConfig(str(masks), str(joints), "cpu")
+    models = ModelsConfig(str(masks), str(joints))
     config = PerceiveConfig(FramesConfig(folder_fps=5.0), models, score=0.0)
 
     def go() -> None:

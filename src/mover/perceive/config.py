@@ -32,8 +32,6 @@ class ModelsConfig:
     """Furniture and people in pictures (Mask2Former or MaskFormer on COCO)."""
     keypoints: str = "usyd-community/vitpose-base-simple"
     """Joints of people (ViTPose on COCO's 17); empty: none."""
-    device: str = "auto"
-    """auto, cpu or cuda."""
 
 
 @dataclass(frozen=True)

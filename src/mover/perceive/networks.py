@@ -49,24 +49,16 @@ class Network:
 
 
 def network(kind: str, config: ModelsConfig) -> Network:
-    """The network of a kind, `masks` or `keypoints`; it is loaded once.
+    """The network of a kind, `masks` or `keypoints`, on the GPU if there is one; loaded once.
 
     Raises:
-        InputError: If transformers, the weights or the device are missing; the message says what
-            to do.
+        InputError: If transformers or the weights are missing; the message says what to do.
     """
-    device = config.device
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
-    if device.split(":")[0] not in ("cpu", "cuda"):
-        raise InputError(f"--models.device: {device!r} is none of auto, cpu, cuda")
-    if device.startswith("cuda") and not torch.cuda.is_available():
-        raise InputError("--models.device: there is no GPU that torch can use, expected cpu")
-    return _loaded(kind, str(getattr(config, kind)), device)
+    return _loaded(kind, str(getattr(config, kind)))
 
 
 @lru_cache(maxsize=4)
-def _loaded(kind: str, name: str, device: str) -> Network:
+def _loaded(kind: str, name: str) -> Network:
     try:
         library: Any = importlib.import_module("transformers")
     except ImportError as error:
@@ -80,6 +72,7 @@ def _loaded(kind: str, name: str, device: str) -> Network:
     except (OSError, ValueError, KeyError, ImportError) as error:
         log.debug("loading %s: %s", name, error)
         raise InputError(absent(kind, replace(ModelsConfig(), **{kind: name}))) from error
+    device = "cuda" if torch.cuda.is_available() else "cpu"
     return Network(model.to(device).eval(), processor, device)
 
 
