@@ -108,13 +108,13 @@ def test_furniture_is_kept_once_and_cups_are_not():
 
 @pytest.mark.parametrize(("fps", "dense"), [(5.0, False), (10.0, True)])
 def test_jumps_ask_for_more_frames_a_second_and_walks_do_not(fps: float, dense: bool):
-    """A person 100 px tall jumps 1.6 times a second by 30 px, or walks."""
+    """A person 100 px tall jumps 1.6 times a second by 26 px, or walks."""
     time = torch.arange(int(6 * fps)) / fps
     person = torch.rand(17, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([30, 100])
     for jumps, walks in ((True, 0.0), (False, 90.0)):
         points = person + torch.stack([walks * time, 0 * time], -1)[:, None]
         if jumps:
-            points[..., 1] += 15 * (2 * torch.pi * 1.6 * time).sin()[:, None]
+            points[..., 1] += 13 * (2 * torch.pi * 1.6 * time).sin()[:, None]
         frames = torch.arange(len(time))
         joints = Keypoints(points, torch.ones(len(time), 17), "coco17", frames, 0 * frames, fps)
         assert restless(joints) == (jumps and not dense)
@@ -130,5 +130,9 @@ def test_the_lens_of_the_lines_counts_before_bodies_are_fitted(spread: float | N
     found, left = lens_by_lines(guess, spread, clean, said.append)
     off = float(found.K[0, 0]) / FOCAL - 1
     assert abs(off) < 0.03 if taken else off == pytest.approx(0.08)
-    assert left == (0.0 if taken else spread)
+    if taken:
+        assert left is not None
+        assert 0 < left < 0.05
+    else:
+        assert left == spread
     assert len(said) == taken

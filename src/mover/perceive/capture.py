@@ -264,8 +264,8 @@ def lens_by_lines(
 ) -> tuple[Camera, float | None]:
     """The camera with the focal length of the picture's own lines, if the given one is a guess.
 
-    Bodies are fitted under it, so it counts before they are. The same lines are not weighted a
-    second time in the room: a focal length that they determine counts as measured.
+    Bodies are fitted under it, so it counts before they are. What it leaves open is handed on: in
+    the room the feet constrain it, too.
     """
     if not spread:
         return camera, spread
@@ -277,7 +277,7 @@ def lens_by_lines(
         f"lens: the lines of the picture show a focal length {100 * (found.zoom - 1):+.1f} ± "
         f"{100 * found.spread:.1f} % of the guess; it is taken (--camera FILE keeps a measured one)"
     )
-    return zoomed(camera, found.zoom), 0.0
+    return zoomed(camera, found.zoom), found.spread
 
 
 def lens_of(size: tuple[int, int], lens: Lens) -> tuple[At, str | None]:
