@@ -31,13 +31,7 @@ def run_each(module: str, jobs: Jobs, workers: int) -> Iterator[int]:
         module: Where `main` is.
         jobs: What is done.
         workers: How many run at once; 0: as many as there are cores.
-
-    Raises:
-        InputError: If the number of workers is negative.
     """
-    if workers < 0:
-        raise InputError(f"--workers: {workers}, expected 0 or more")
-
     running: list[subprocess.Popen[bytes]] = []
     lock, stopped = Lock(), Event()
 
