@@ -9,28 +9,17 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from mover.app.pictures.film import pixels, save_still, sized
-from mover.app.pictures.paint import FINE, draw_picture, furniture, joined, skin
+from mover.app.pictures.paint import FINE, draw_picture, furniture
 from mover.core.colours import colour, css
 from mover.core.records import map_tensors
-from mover.core.types import Capture, Mesh, Scene
+from mover.core.types import Capture, Scene
 
 WIDEST = 1280  # [px], of a picture in the report
 
 
-def draw_overlay(
-    image: Float[Tensor, "h w 3"] | None, scene: Scene, bodies: Mesh | None = None
-) -> Float[Tensor, "height width 3"]:
-    """Draw the furniture of `scene` over `image`, which shows the whole view of its camera.
-
-    Args:
-        image: The reference image in [0, 1], of any resolution; None: a neutral backdrop.
-        scene: The furniture and its camera.
-        bodies: People to draw with it, in the scene's world [m].
-    """
-    if image is None:
-        image = backdrop(scene.camera.height, scene.camera.width)
-    people = [] if bodies is None else [skin(bodies.verts, bodies.faces, 0)]
-    surfaces = joined([furniture(scene), *people])
+def draw_overlay(image: Float[Tensor, "h w 3"], scene: Scene) -> Float[Tensor, "height width 3"]:
+    """Draw the furniture of `scene` over a picture in [0, 1] of the whole view of its camera."""
+    surfaces = furniture(scene)
     if not len(surfaces.faces):
         return image
     picture, owner = draw_picture(surfaces, scene.camera, image, scene.ground)

@@ -68,16 +68,16 @@ def furniture(scene: Scene) -> Surfaces:
 
 
 def people(bodies: Bodies, rows: list[int]) -> Surfaces:
-    """Some rows of the bodies, which are in the world."""
-    return joined([skin(bodies.verts[row], bodies.faces, int(bodies.person[row])) for row in rows])
-
-
-def skin(verts: Float[Tensor, "verts 3"], faces: Int[Tensor, "faces 3"], person: int) -> Surfaces:
-    """One body, smooth, in the colour of a person."""
-    verts, faces = verts.detach().float(), faces.long()
-    normals = normalize(vertex_normals(verts, faces)[faces].sum(1), dim=-1)
-    tint = torch.tensor(person_colour(person)).expand(len(faces), 3)
-    return Surfaces(verts, faces, normals, tint, torch.full((len(faces),), PERSON + person))
+    """Some rows of the bodies, which are in the world, smooth, in the colours of the people."""
+    parts: list[Surfaces] = []
+    for row in rows:
+        verts, faces = bodies.verts[row].detach().float(), bodies.faces.long()
+        person = int(bodies.person[row])
+        normals = normalize(vertex_normals(verts, faces)[faces].sum(1), dim=-1)
+        tint = torch.tensor(person_colour(person)).expand(len(faces), 3)
+        owner = torch.full((len(faces),), PERSON + person)
+        parts.append(Surfaces(verts, faces, normals, tint, owner))
+    return joined(parts)
 
 
 def joined(parts: list[Surfaces]) -> Surfaces:
