@@ -15,13 +15,14 @@ import torch
 from scipy.stats import bootstrap
 
 from mover.app.cli import run_command
+from mover.app.report.tables import shown
 from mover.core import records
 from mover.core.errors import InputError
 from mover.core.observe import Step
 from mover.core.run import Run
 from mover.core.types import Camera, Capture, Detection, Masks, Scene
 from mover.energy.config import Adam
-from mover.evaluate.evaluation import METRICS, EvaluateConfig
+from mover.evaluate.evaluation import EvaluateConfig
 from mover.geometry.camera import to_camera
 from mover.geometry.placement import place_object
 from mover.geometry.raster import first_hit
@@ -389,10 +390,10 @@ class TestWithheld:
 
 class TestTables:
     def test_columns_speak_of_centimetres_and_degrees(self) -> None:
-        assert METRICS["p2s"].shown(0.123, unit=True) == "12.3\N{NO-BREAK SPACE}cm"
-        assert METRICS["pitch_error"].shown(math.radians(-0.25), unit=True) == "\N{MINUS SIGN}0.25°"
-        assert METRICS["pje"].shown(math.nan) == METRICS["pje"].shown(None) == "\N{EN DASH}"
-        assert METRICS["iou3d"].shown(-1e-9, sign=True) == "+0.000"
+        assert shown("m", 0.123, named=True) == "12.3\N{NO-BREAK SPACE}cm"
+        assert shown("rad", math.radians(-0.25), named=True) == "\N{MINUS SIGN}0.25°"
+        assert shown("m", math.nan) == shown("m", None) == "\N{EN DASH}"
+        assert shown("", -1e-9, sign=True) == "+0.000"
         assert [head_of(n) for n in ("p2s", "iou3d", "contact")] == [
             "p2s [cm] ↓", "iou3d ↑", "contact [%]",
         ]  # fmt: skip

@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from mover.app.report.tables import SHOWN, shown
 from mover.core.files import replacing
 from mover.core.records import plain
 from mover.evaluate.evaluation import METRICS
-from mover.evaluate.scene import SHOWN
 from mover_bench.experiment.args import ExperimentArgs
 from mover_bench.experiment.job import path_of, read_numbers
 from mover_bench.experiment.sets import set_named
@@ -157,9 +157,9 @@ def page_of(args: ExperimentArgs, names: Sequence[str], found: Finished) -> str:
     if not len(found.scenes):
         return "\n\n".join(lines) + "\n"
     rows = list(dict.fromkeys(VARIANTS[name].row or name for name in names))
-    shown = [(rows[0], "initial"), (rows[0], "image"), *((row, "full") for row in rows)]
+    lead = [(rows[0], "initial"), (rows[0], "image"), *((row, "full") for row in rows)]
     means = by_room(found.scenes)
-    lines += ["## Mean over rooms", _means(means, shown)]
+    lines += ["## Mean over rooms", _means(means, lead)]
     lines += [f"## Difference from {rows[0]}", _differences(means, rows)] if rows[1:] else []
     return "\n\n".join(lines) + "\n"
 
@@ -170,15 +170,15 @@ def _chosen(means: Frame, row: str, stage: str) -> Frame:
     return means[(level("row") == row) & (level("stage") == stage)].droplevel(["row", "stage"])
 
 
-def _means(means: Frame, shown: Iterable[tuple[str, str]]) -> str:
+def _means(means: Frame, keys: Iterable[tuple[str, str]]) -> str:
     """One line for each row and stage; metrics that no line has are left out."""
     columns = [name for name in COLUMNS if name in means and means[name].notna().any()]
     lines: list[list[str]] = []
-    for key in shown:
+    for key in keys:
         rooms = _chosen(means, *key)
         if not len(rooms):
             continue
-        cells = [METRICS[name].shown(float(rooms[name].mean())) for name in columns]
+        cells = [shown(METRICS[name].unit, float(rooms[name].mean())) for name in columns]
         lines.append([", ".join(key) if key[1] != "full" else key[0], *cells, str(len(rooms))])
     return markdown(["", *map(head_of, columns), "rooms"], lines)
 
@@ -197,8 +197,8 @@ def _differences(means: Frame, rows: Sequence[str]) -> str:
             if not len(values):
                 cells.append("-")
                 continue
-            gap, column = interval(values), METRICS[name]
-            ends = " … ".join(column.shown(x, sign=True) for x in (gap.low, gap.high))
-            cells.append(f"{column.shown(gap.mean, sign=True)} ({ends})")
+            gap, unit = interval(values), METRICS[name].unit
+            ends = " … ".join(shown(unit, x, sign=True) for x in (gap.low, gap.high))
+            cells.append(f"{shown(unit, gap.mean, sign=True)} ({ends})")
         lines.append([row, *cells, str(int(gaps[columns].notna().any(axis=1).sum()))])
     return markdown(["", *map(head_of, columns), "rooms"], lines)

@@ -30,34 +30,17 @@ PLASTIC = 1.32471795724474602596  # x³ = x + 1: its powers spread points evenly
 NEARER = 1e-3  # [1/m], boxes that do not overlap are paired by distance: this breaks the tie
 
 
-SHOWN = {
-    "": ("", 1.0, 3), "share": ("%", 100.0, 1), "m": ("cm", 100.0, 1),
-    "rad": ("°", math.degrees(1), 2),
-}  # fmt: skip
-"""The unit in which a number of a unit is shown, its factor and its digits."""
-
-
 @dataclass(frozen=True)
 class Metric(Generic[T]):
     """One line of the table of metrics."""
 
     label: str
     unit: str
-    """`m`, `rad`, `share` (shown in per cent) or nothing."""
+    """`m`, `rad`, `share` or nothing."""
     best: float
     """What a perfect reconstruction scores: 1 where more is better, 0 where less is."""
     measure: Callable[[T], float | None]
     """The value, or None where the truth that it needs is missing."""
-
-    def shown(self, value: float | None, *, sign: bool = False, unit: bool = False) -> str:
-        """The value as people read it; a dash where there is none."""
-        if value is None or not math.isfinite(value):
-            return "\N{EN DASH}"
-        name, factor, digits = SHOWN[self.unit]
-        rounded = round(factor * value, digits) + 0.0  # no negative zero
-        text = f"{rounded:{'+' if sign else ''}.{digits}f}".replace("-", "\N{MINUS SIGN}")
-        space = "\N{NO-BREAK SPACE}" if name not in ("", "°") else ""
-        return text + space + name if unit else text
 
 
 @record

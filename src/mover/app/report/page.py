@@ -27,6 +27,7 @@ from mover.app.report.tables import (
     metrics_table,
     objects_table,
     settings_of,
+    shown,
 )
 from mover.core.files import replacing
 from mover.core.records import map_tensors
@@ -148,7 +149,8 @@ def _tiles(content: ReportContent) -> list[tuple[str, str, str]]:
     before, after = ((content.metrics or {}).get(k) or {} for k in ("initial", "result"))
     metrics = [(key, metric_of(key)) for key in TILES if key in after]
     return [
-        (m.label, m.shown(before.get(key)), m.shown(after[key], unit=True)) for key, m in metrics
+        (m.label, shown(m.unit, before.get(key)), shown(m.unit, after[key], named=True))
+        for key, m in metrics
     ]
 
 

@@ -23,6 +23,24 @@ QUANTITIES: dict[str, Metric[Any]] = {**METRICS, **PHYSICS_METRICS}
 """How the numbers of metrics.json are shown, in their order."""
 
 
+SHOWN = {
+    "": ("", 1.0, 3), "share": ("%", 100.0, 1), "m": ("cm", 100.0, 1),
+    "rad": ("°", math.degrees(1), 2),
+}  # fmt: skip
+"""The unit in which a number of a unit is shown, its factor and its digits."""
+
+
+def shown(unit: str, value: float | None, *, sign: bool = False, named: bool = False) -> str:
+    """A number of a metric as people read it; a dash where there is none."""
+    if value is None or not math.isfinite(value):
+        return NOTHING
+    name, factor, digits = SHOWN[unit]
+    rounded = round(factor * value, digits) + 0.0  # no negative zero
+    text = f"{rounded:{'+' if sign else ''}.{digits}f}".replace("-", "\N{MINUS SIGN}")
+    space = "\N{NO-BREAK SPACE}" if name not in ("", "°") else ""
+    return text + space + name if named else text
+
+
 def write_value(value: Any) -> str:  # noqa: ANN401
     """Any plain value as text."""
     match value:
@@ -117,11 +135,11 @@ def metric_of(key: str) -> Metric[Any]:
 def _metric_row(key: str, before: float | None, after: float | None) -> list[Cell]:
     metric, change, mood = metric_of(key), NOTHING, ""
     if before is not None and after is not None:
-        change = metric.shown(after - before, sign=True)
+        change = shown(metric.unit, after - before, sign=True)
         if key in QUANTITIES and any(c in "123456789" for c in change):
             mood = "better" if (after > before) == (metric.best > 0) else "worse"
-    shown = (metric.shown(value, unit=True) for value in (before, after))
-    return [Cell(metric.label), *map(Cell, shown), Cell(change, mood)]
+    both = (shown(metric.unit, value, named=True) for value in (before, after))
+    return [Cell(metric.label), *map(Cell, both), Cell(change, mood)]
 
 
 def objects_table(
@@ -144,8 +162,8 @@ def objects_table(
         values = [*_change_cells(changes.get(item.id))]
         for key in judged:
             before, after = (side.get(key) for side in sides)
-            metric = metric_of(key)
-            values.append(f"{metric.shown(before)} → {metric.shown(after, unit=True)}")
+            unit = metric_of(key).unit
+            values.append(f"{shown(unit, before)} → {shown(unit, after, named=True)}")
         values += [write_value(extra.get(item.id, {}).get(f)) for f in fields]
         head = [Cell(item.id, tint=css(colour(index))), Cell(item.category, "text")]
         lines.append([*head, *map(Cell, values)])
