@@ -19,10 +19,11 @@ import torch
 
 from mover.core.errors import InputError
 from mover.core.files import copy_whole
-from mover.core.types import Bodies, BodyPose, Scene
+from mover.core.types import Bodies, Scene
 from mover.io.capture.bodies_file import bodies_to_arrays, write_bodies
 from mover.io.capture.camera_file import camera_of
 from mover.io.capture.parts import Hints, Parts, image_parts
+from mover.io.capture.pose_file import joined_bodies
 from mover.io.capture.scene_file import write_scene
 from mover.io.files.cameras import read_camera_file
 from mover.io.files.fields import At, read_json, write_json
@@ -181,32 +182,10 @@ def _joined(
         return parts[0] if parts else None
     if len({tuple(part.faces.shape) + tuple(part.verts.shape[1:]) for part in parts}) > 1:
         raise InputError("the recordings have bodies of different models, expected one")
-    pose = _joined_pose([part.pose for part in parts])
-    if pose is None:
+    whole = joined_bodies(parts)
+    if whole.pose is None:
         notes.append("the bodies of several models are kept as meshes, without their parameters")
-    joints = [part.joints for part in parts if part.joints is not None]
-    whole = len(joints) == len(parts)
-    return dataclasses.replace(
-        parts[0],
-        verts=torch.cat([part.verts for part in parts]),
-        joints=torch.cat(joints) if whole else None,
-        joint_names=parts[0].joint_names if whole else (),
-        frame=torch.cat([part.frame for part in parts]),
-        person=torch.cat([part.person for part in parts]),
-        pose=pose,
-    )
-
-
-def _joined_pose(poses: Sequence[BodyPose | None]) -> BodyPose | None:
-    """Parameters of one model together; None where there are several, or none."""
-    known = [pose for pose in poses if pose is not None]
-    kinds = {(pose.model, pose.gender, pose.betas.shape[1], tuple(pose.extra)) for pose in known}
-    if len(known) < len(poses) or len(kinds) != 1:
-        return None
-    names = ("betas", "global_orient", "body_pose", "transl")
-    rows = {name: torch.cat([getattr(pose, name) for pose in known]) for name in names}
-    extra = {name: torch.cat([pose.extra[name] for pose in known]) for name in known[0].extra}
-    return dataclasses.replace(known[0], **rows, extra=extra)
+    return whole
 
 
 def _with_truth(parts: Parts, lines: Sequence[Timeline], lens: At, hints: Hints) -> Parts:

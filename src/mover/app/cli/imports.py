@@ -14,7 +14,7 @@ from mover.app.cli.config import parsed
 from mover.app.cli.people import tracks_of
 from mover.core.errors import InputError
 from mover.core.settings import Index, Rate, float_in
-from mover.io.formats import IMPORTED, chosen, listing
+from mover.io.formats import IMPORTED, chosen, listing, names
 
 if TYPE_CHECKING:
     from mover.io.capture.merge import Imported
@@ -162,6 +162,10 @@ def _parts(args: ImportArgs, main: "Parts", hints: "Hints") -> "list[Parts]":
         extra = dataclasses.replace(extra, bodies=bodies)
     if args.cameras is not None:
         tool = args.cameras_from
+        if not tool and args.cameras.suffix.lower() != ".npz":
+            tools = ", ".join(names("cameras"))
+            raise InputError(f"{args.cameras.name}: is no cameras.npz; name its tool "
+                             f"(--cameras-from {tools})")  # fmt: skip
         read = chosen("--cameras-from", tool, "cameras") if tool else read_npz
         poses: At = read(args.cameras)
         if args.reference_frame is not None:

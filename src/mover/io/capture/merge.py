@@ -23,7 +23,7 @@ from mover.io.capture.camera_file import camera_of, turned
 from mover.io.capture.folder import REFERENCE, folder_parts, read_capture, write_trees
 from mover.io.capture.pairing import linked, named_rows, pair_rows
 from mover.io.capture.parts import UNKNOWN, Parts
-from mover.io.capture.pose_file import joined_poses
+from mover.io.capture.pose_file import joined_bodies
 from mover.io.capture.tracks import numbers_beside, renumbered
 from mover.io.files.fields import At, get, items, listed, maybe, refuse, write_json
 from mover.io.files.images import write_image
@@ -122,52 +122,37 @@ def _bodies(old: At | None, new: At | None) -> tuple[At | None, tuple[str, ...]]
         refuse(get(new, "space"), f"{first.space!r}, as the bodies that are there")
     numbers, same = numbers_beside(first, second)
     second = replace(second, person=renumbered(second.person, numbers))
+    notes = [f"{new.file}: its person {a} is person {b} here" for a, b in numbers.items() if a != b]
+    if again := sorted(same):
+        notes.append(f"{new.file}: replaces {listed('track', again)} of the same people")
+    if added := sorted({*second.person.tolist()} - same):
+        notes.append(f"{new.file}: adds {listed('track', added)} to bodies.npz")
+    whole = _united(first, second, same, new.file)
+    if whole.pose is None and (first.pose is not None or second.pose is not None):
+        notes.append("bodies.npz: parameters of two kinds, so that the meshes alone are kept")
+    if None not in (first.fps, second.fps) and first.fps != second.fps:
+        notes.append(f"bodies.npz: frame rates {first.fps:g} and {second.fps:g}; the newer counts")
+    return At(bodies_to_arrays(whole), new.file), tuple(notes)
+
+
+def _united(first: Bodies, second: Bodies, same: set[int], file: str) -> Bodies:
+    """The rows of both in the order of frames, without those of the first that are given again."""
     kept = torch.ones(len(first.frame), dtype=torch.bool)
     for one in same:
         frame = second.frame[second.person == one]
         kept &= (first.person != one) | (first.frame < frame.min()) | (first.frame > frame.max())
-    notes = [f"{new.file}: its person {a} is person {b} here" for a, b in numbers.items() if a != b]
-    if again := sorted(same):
-        notes.append(f"{new.file}: replaces {listed('track', again)} of the same people")
     if not kept.any():
-        return At(bodies_to_arrays(second), new.file), tuple(notes)
+        return second
     counts = [one.verts.shape[1] for one in (first, second)]
     if counts[0] != counts[1] or not torch.equal(first.faces, second.faces):
         raise InputError(
-            f"{new.file}: has bodies of {counts[1]} vertices, those in the capture {counts[0]}, "
+            f"{file}: has bodies of {counts[1]} vertices, those in the capture {counts[0]}, "
             "expected one topology (remove its bodies.npz to put these in its place)"
         )
-    added = sorted({*second.person.tolist()} - same)
-    notes.append(f"{new.file}: adds {listed('track', added)} to bodies.npz" if added else "")
-    whole, lost = _joined(rows_of(first, kept.nonzero()[:, 0]), second)
-    return At(bodies_to_arrays(whole), new.file), (*filter(None, notes), *lost)
-
-
-def _joined(first: Bodies, second: Bodies) -> tuple[Bodies, list[str]]:
-    """Rows of both in the order of their frames, and what of them is left out."""
-    lost, pose = list[str](), None
-    if first.pose is not None and second.pose is not None:
-        pose = joined_poses(first.pose, second.pose)
-    if pose is None and (first.pose is not None or second.pose is not None):
-        lost.append("bodies.npz: their parameters differ in kind, so the meshes alone are kept")
-    if first.fps is not None and second.fps is not None and first.fps != second.fps:
-        lost.append(f"bodies.npz: frame rates {first.fps:g} and {second.fps:g}; the newer counts")
-    same = first.joint_names == second.joint_names
-    both = ((first.joints, second.joints),) if same and first.joints is not None else ()
-    whole = replace(
-        second,
-        verts=torch.cat([first.verts, second.verts]),
-        joints=next((torch.cat([a, b]) for a, b in both if b is not None), None),
-        joint_names=first.joint_names if both else (),
-        frame=torch.cat([first.frame, second.frame]),
-        person=torch.cat([first.person, second.person]),
-        fps=first.fps if second.fps is None else second.fps,
-        pose=pose,
-        size_spread=first.size_spread if first.size_spread == second.size_spread else None,
-        mean_shape=first.mean_shape and second.mean_shape,
-    )
+    whole = joined_bodies([rows_of(first, kept), second])
+    whole = replace(whole, fps=first.fps if second.fps is None else second.fps)
     order = torch.argsort(whole.person, stable=True)
-    return rows_of(whole, order[torch.argsort(whole.frame[order], stable=True)]), lost
+    return rows_of(whole, order[torch.argsort(whole.frame[order], stable=True)])
 
 
 def _objects(old: Parts, new: Parts) -> At | None:

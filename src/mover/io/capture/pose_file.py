@@ -1,6 +1,7 @@
 """Parameters of body models in bodies.npz, with the names and meaning of the smplx package."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -130,19 +131,31 @@ def pose_to_arrays(pose: BodyPose) -> dict[str, NDArray[Any]]:
     return words | {key: value.detach().cpu().numpy() for key, value in tensors.items()}
 
 
-def joined_poses(first: BodyPose, second: BodyPose) -> BodyPose | None:
-    """Parameters of both, shapes filled up with zeros; None if they are of different kinds."""
-    kinds = [(p.model, p.gender, p.body_pose.shape[1], {k: v.shape[1:] for k, v in p.extra.items()})
-             for p in (first, second)]  # fmt: skip
-    if kinds[0] != kinds[1]:
-        return None
-    most = max(p.betas.shape[1] for p in (first, second))
-    betas = [
-        torch.nn.functional.pad(p.betas, (0, most - p.betas.shape[1])) for p in (first, second)
-    ]
-    rest = {name: torch.cat([getattr(first, name), getattr(second, name)]) for name in NEEDED[1:]}
-    extra = {name: torch.cat([value, second.extra[name]]) for name, value in first.extra.items()}
-    return BodyPose(first.model, first.gender, torch.cat(betas), **rest, extra=extra)
+def joined_bodies(parts: Sequence[Bodies]) -> Bodies:
+    """Rows of several of one topology together; the last gives what is of all.
+
+    Joints and parameters are kept where all have them and of one kind.
+    """
+    last = parts[-1]
+    poses = [part.pose for part in parts if part.pose is not None]
+    kinds = {(p.model, p.gender, p.betas.shape[1], p.body_pose.shape[1],
+              *((name, one.shape[1]) for name, one in p.extra.items())) for p in poses}  # fmt: skip
+    pose = None
+    if len(poses) == len(parts) and len(kinds) == 1:
+        rows = {name: torch.cat([getattr(p, name) for p in poses]) for name in NEEDED}
+        extra = {name: torch.cat([p.extra[name] for p in poses]) for name in poses[0].extra}
+        pose = dataclasses.replace(poses[0], **rows, extra=extra)
+    joints = [part.joints for part in parts if part.joints is not None]
+    whole = len(joints) == len(parts) and len({part.joint_names for part in parts}) == 1
+    spreads = {part.size_spread for part in parts}
+    rows = {name: torch.cat([getattr(part, name) for part in parts])
+            for name in ("verts", "frame", "person")}  # fmt: skip
+    return dataclasses.replace(
+        last, **rows, joints=torch.cat(joints) if whole else None, pose=pose,
+        joint_names=last.joint_names if whole else (),
+        size_spread=last.size_spread if len(spreads) == 1 else None,
+        mean_shape=all(part.mean_shape for part in parts),
+    )  # fmt: skip
 
 
 # Parameters of bodies: posed, and moved as rigid bodies, whose root turns about the pelvis.

@@ -41,7 +41,7 @@ def read_npz(path: Path) -> At:
     Raises:
         InputError: If it is missing, broken or too large.
     """
-    name = path.name
+    name = path.name or path.resolve().name
     if not path.is_file():
         raise InputError(f"{name}: there is no such file in {path.parent}, expected an .npz file")
     try:

@@ -93,7 +93,13 @@ class Tool:
 def read(path: Path, known: Known, tool: str) -> Found:
     """Bodies that a tool found, as its row of the table says."""
     row = TOOLS[tool]
-    found = [_rows(row, person, known) for person in row.people(path, known)]
+    found: list[Found] = []
+    for person in row.people(path, known):
+        try:
+            found.append(_rows(row, person, known))
+        except InputError as error:  # what is known of the file is said with it
+            said = [f"{path.name}: {text}" for text in person.warnings]
+            raise InputError("; ".join([str(error), *said])) from error
     if not found:
         raise InputError(f"{path.name}: has no people, expected at least one")
     return joined(found)
