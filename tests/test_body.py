@@ -249,7 +249,7 @@ def test_wrong_numbers_of_angles_and_shape_coefficients_are_refused():
     with pytest.raises(InputError, match=r"'left_hand_pose' has 6 columns"):
         open_body().posed(replace(still, extra={"left_hand_pose": torch.zeros(1, 6)}))
     with pytest.raises(InputError, match=r"'betas' has 16 columns"):
-        open_body().posed(replace(still, betas=torch.zeros(1, 16)))
+        open_body().posed(replace(still, betas=torch.ones(1, 16)))
 
 
 def test_check_closed_finds_a_hole_and_a_flipped_face():

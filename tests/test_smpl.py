@@ -380,7 +380,7 @@ def test_too_many_numbers_of_pose_and_shape_are_refused(folder):
         with pytest.raises(InputError, match=message):
             model.posed(replace(rest, **changes))
 
-    refused(r"'betas' has 11 columns", betas=torch.zeros(1, 11))
+    refused(r"'betas' has 11 columns", betas=torch.ones(1, 11))
     refused(r"'body_pose' has 69 columns.*expects 63", body_pose=torch.zeros(1, 69))
     refused(r"'expression' has 50 columns.*knows 10", extra={"expression": torch.zeros(1, 50)})
     refused(r"'left_hand_pose' has 46", extra={"left_hand_pose": torch.zeros(1, 46)})
