@@ -1,4 +1,4 @@
-"""Every `mover` command in the README and the docs is one that the program understands."""
+"""Every command in the README and the docs is one that the program understands; Python runs."""
 
 import contextlib
 import io
@@ -136,3 +136,9 @@ def test_a_wrong_command_would_be_found(line: str):
     name, *words = words_of(line)
     with pytest.raises(SystemExit), contextlib.redirect_stderr(io.StringIO()):
         command_of(name)(words)
+
+
+@pytest.mark.parametrize("page", PAGES[2:], ids=lambda page: page.stem)
+def test_python_in_the_docs_runs(page: Path):
+    for code in re.findall(r"^```python\n(.*?)^```", page.read_text(), re.S | re.M):
+        exec(compile(code, page.name, "exec"), {})
