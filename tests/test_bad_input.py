@@ -49,7 +49,6 @@ JSON = [
     ("camera.json", "w", 1 << 20, "'w' has 1048576"),
     ("camera.json", "h", ..., "'h' has nothing"),
     ("camera.json", "fl_x", 0.0, "'fl_x' has 0.0, expected a number above 0"),
-    ("camera.json", "fl_x", -3, "'fl_x' has -3"),
     ("camera.json", "fl_y", NAN, "'fl_y' has nan"),
     ("camera.json", "cx", "a", "'cx' has \"a\""),
     ("camera.json", "cy", float("inf"), "'cy' has inf"),
@@ -58,7 +57,6 @@ JSON = [
     ("camera.json", "height", -1.4, "'height' has -1.4"),
     ("camera.json", "R_cam_world", [[1, 0, 0], [0, 1, 0]], "2 items"),
     ("camera.json", "R_cam_world", [[1, 0, 0], [0, 1, 0], [0, 0, -1]], "rotation matrix"),
-    ("camera.json", "R_cam_world", [[2, 0, 0], [0, 2, 0], [0, 0, 2]], "rotation matrix"),
     ("camera.json", "R_cam_world", [[1, 0, 0], [0, 1, 0], [0, 0, NAN]], r"R_cam_world\[2\]\[2\]"),
     ("scene.json", "format", "usd", "'format' has \"usd\", expected one of mover-scene"),
     ("scene.json", "version", 2, "'version' has 2"),
@@ -91,7 +89,6 @@ JSON = [
     ("scene.json", "objects.0.yaw", 10**400, "yaw"),
     ("scene.json", "objects.0.scale", 1.0, "scale"),
     ("scene.json", "objects.0.scale", [1, 0, 1], r"scale\[1\]' has 0, expected a number above 0"),
-    ("scene.json", "objects.0.scale", [1, 1, -1], r"scale\[2\]"),
     ("scene.json", "objects.0.support", "sofa", "'sofa'"),
     ("scene.json", "objects.0.support", "chair_0", "circle"),
     ("scene.json", "objects.0.support", "Lampe_ä.2", "circle"),
@@ -114,7 +111,6 @@ JSON = [
     ("objects.json", "annotations.0.bbox", [64, 2, 3, 4], "inside the image of 64 x 48"),
     ("objects.json", "annotations.0.segmentation", SQUARE, r"size \[10, 10\], expected \[48, 64\]"),
     ("objects.json", "annotations.0.segmentation.counts", [5], "sum to"),
-    ("objects.json", "annotations.0.segmentation.counts", "0", "sum to"),
     ("objects.json", "annotations.0.segmentation.counts", [48 * 64], "an empty mask"),
     ("objects.json", "annotations.1.segmentation.0", [1, 1, 2, 2], "4 items"),
     ("objects.json", "annotations.1.segmentation.0", [1, 1, 1, 1, 1, 1], "an empty mask"),
@@ -135,29 +131,13 @@ JSON = [
     ("camera.json", "fl_x", 1e8, "'fl_x' has 1e.08, expected 3.2 to 6400 px for 64 px"),
     ("camera.json", "fl_y", 1e-8, "'fl_y' has 1e-08, expected a number above 0|'fl_y' has 1e-08"),
     ("camera.json", "cx", 1e8, "'cx' has 1e.08, expected -640 to 640 px"),
-    (
-        "scene.json",
-        "ground.height",
-        -80,
-        "'ground.height' has -80, expected a finite number from -30",
-    ),
+    ("scene.json", "ground.height", -80, "has -80, expected a finite number from -30"),
     ("scene.json", "objects.0.translation", [1e9, 0, 0], "translation' of chair_0 is 1e.09 m away"),
-    (
-        "scene.json",
-        "objects.1.translation",
-        [0, 0, -500],
-        r"objects\[1\].translation.* is 500 m away",
-    ),
+    ("scene.json", "objects.1.translation", [0, 0, -500], r"\[1\].translation.* is 500 m away"),
     ("scene.json", "objects.0.yaw", 1e8, "yaw' of chair_0 has 1e.08 rad, expected -1000 to 1000"),
-    (
-        "scene.json",
-        "objects.0.scale",
-        [1000] * 3,
-        "2e.03 m large, expected .*millimetres",
-    ),
+    ("scene.json", "objects.0.scale", [1000] * 3, "2e.03 m large, expected .*millimetres"),
     ("scene.json", "objects.0.scale", [50, 100, 60], "100 m large.*centimetres. Multiply .* 0.01"),
     ("scene.json", "objects.0.scale", [1e-8] * 3, "2e-08 m large, expected 0.01 to 30 m"),
-    ("scene.json", "objects.0.scale", [1e6] * 3, "2e.06 m large"),
 ]
 
 
@@ -322,7 +302,7 @@ def test_a_link_that_leaves_the_folder_is_refused(folder: Path) -> None:
     refused(folder, "scene.json", "a link that leaves it")
 
 
-def test_a_picture_of_another_size_is_told_with_both_sizes(folder: Path) -> None:
+def test_a_picture_of_another_size_is_refused_with_both_sizes(folder: Path) -> None:
     from PIL import Image
 
     Image.fromarray(tiny.picture()[:-1]).save(folder / "room.png")
@@ -361,7 +341,7 @@ def test_frames_behind_the_end_of_the_video_are_refused(folder: Path) -> None:
         ("camera.json", "R_cam_world", [[1, 0, 0], [0, 0, 1], [0, -1, 0]], "straight up or down"),
     ],
 )  # fmt: skip
-def test_what_is_odd_but_not_wrong_is_told(
+def test_what_is_odd_but_not_wrong_is_a_warning(
     folder: Path, file: str, path: str, value: object, words: str
 ) -> None:
     tree = json.loads((folder / file).read_text())
@@ -402,14 +382,14 @@ def with_far(verts: np.ndarray) -> np.ndarray:
         (lambda a: {**a, "joints": a["joints"] + 5}, "'joints' is 8.5 m off the meshes"),
     ],
 )
-def test_bodies_that_are_odd_are_told(
+def test_odd_bodies_are_a_warning(
     folder: Path, change: Callable[[dict[str, Any]], dict[str, Any]], words: str
 ) -> None:
     np.savez(folder / "bodies.npz", **change(tiny.bodies()))
     assert words in "\n".join(read_capture(folder).warnings)
 
 
-def test_two_objects_with_one_mask_are_told(folder: Path) -> None:
+def test_two_objects_with_one_mask_are_a_warning(folder: Path) -> None:
     tree = tiny.objects()
     for key in ("segmentation", "bbox"):
         tree["annotations"][1][key] = tree["annotations"][0][key]
@@ -418,7 +398,7 @@ def test_two_objects_with_one_mask_are_told(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["camera.json", "scene.json", "objects.json", "people.json"])
-def test_a_name_that_is_told_twice_is_refused(folder: Path, name: str) -> None:
+def test_a_name_that_is_there_twice_is_refused(folder: Path, name: str) -> None:
     text = (folder / name).read_text()
     (folder / name).write_text('{"info": 1, "info": 2, ' + text[1:])
     refused(folder, name, 'the name "info" is there twice')
