@@ -123,6 +123,31 @@ def test_body_indices_are_masks_of_the_flipped_pictures(stills: Path, tmp_path: 
     assert torch.equal(found, wanted)
 
 
+def test_the_reference_is_the_emptiest_picture_and_who_is_in_it_is_masked(
+    stills: Path, tmp_path: Path
+) -> None:
+    root = shutil.copytree(stills, tmp_path / "p")
+    stem = layouts.prox_stem(FIRST, 1)
+    pixels = np.full((1080, 1920), 255, dtype=np.uint8)
+    pixels[300:310, 400:420] = 0
+    Image.fromarray(pixels).save(root / "recordings" / FIRST / "BodyIndexColor" / f"{stem}.png")
+    color = root / "recordings" / FIRST / "Color" / f"{stem}.jpg"
+    Image.new("RGB", (1920, 1080), (200, 10, 10)).save(color)
+    found = imported("prox", root, tmp_path / "out", tmp_path, recording=FIRST)
+    assert (
+        "the reference image is frame 1, the emptiest: it has people on 0.0% of it" in found.notes
+    )
+    reference = next((tmp_path / "out").glob("reference.*"))
+    with Image.open(reference) as picture:
+        assert np.abs(np.asarray(picture.convert("RGB"))[5, 5] - [200, 10, 10]).max() < 20
+    (row,) = rows_of(tmp_path / "out")["reference_people"]
+    height, width = row["segmentation"]["size"]
+    mask = decode(Masks(height, width, (row["segmentation"]["counts"].encode(),)), 0)
+    wanted = torch.zeros(1080, 1920, dtype=torch.bool)
+    wanted[300:310, 1500:1520] = True
+    assert torch.equal(mask, wanted)
+
+
 @pytest.mark.parametrize(
     ("pixels", "said"),
     [

@@ -25,8 +25,10 @@ def show_paper_table(arguments: Sequence[str]) -> None:
     """`mover paper-table`."""
     args = parsed(TableArgs, "mover paper-table", arguments)
     from mover.app.cli.progress import Bar
-    from mover_bench.tables.paper_table import paper_table
+    from mover_bench.tables.paper_table import paper_table, planned
 
+    if not args.look:
+        say(planned(args))
     with Bar() as bar:
         page = paper_table(args, bar)
     say(f"{page.read_text()}\ntable: {page}")

@@ -29,18 +29,22 @@ from mover.io.files.cameras import read_camera_file
 from mover.io.files.fields import At, read_json, write_json
 from mover.io.files.images import opened
 from mover.io.files.schema import rigid
+from mover.io.masks.instances import Instance, Instances, with_reference_people
 from mover.io.scenes.placing import Matrix
 from mover_bench.datasets.prox_files import (
     FITS,
     FOLDERS,
     FPS,
+    GIVEN_FITS,
     QUANTITATIVE,
     SIZE,
     Recording,
     Timeline,
     asked_for,
+    body_indices,
     keypoint_trees,
-    people_masks,
+    people_of,
+    pixels_of,
     timelines,
     world_of,
 )
@@ -82,16 +86,17 @@ def prox_parts(root: Path, hints: Hints) -> Parts:
     for line, found in zip(lines, fits, strict=True):
         trees |= keypoint_trees(line, found, camera_of(lens), notes)
     fps = None if lines[0].stills else FPS
+    masks = body_indices(lines, tracks)
     name = recordings[0].name if len(recordings) == 1 else recordings[0].scene
     parts = Parts(
         name=name,
         camera=lens,
         bodies=None if bodies is None else At(bodies_to_arrays(bodies), name),
-        people=people_masks(lines, tracks, fps),
+        people=people_of(masks, fps),
         beside={place: partial(write_json, tree) for place, tree in trees.items()},
         notes=(*notes, *_missing(lines)),
     )
-    parts = _with_pictures(parts, lines, hints)
+    parts = _with_pictures(_with_given_fits(parts, lines, tracks), lines, masks, hints)
     return _with_truth(parts, lines, lens, hints)
 
 
@@ -116,8 +121,25 @@ def _missing(lines: Sequence[Timeline]) -> list[str]:
     return list(dict.fromkeys(notes))
 
 
-def _with_pictures(parts: Parts, lines: Sequence[Timeline], hints: Hints) -> Parts:
-    """The parts with all pictures, flipped left to right; the first is the reference image."""
+def _with_given_fits(parts: Parts, lines: Sequence[Timeline], tracks: Mapping[str, int]) -> Parts:
+    """The parts with the fits of stills that the paper compares with, in fits/."""
+    beside = dict(parts.beside)
+    for kind in GIVEN_FITS if lines[0].stills else ():
+        found = [(line, _fits(line, (f"fittings/{kind}",), [])) for line in lines]
+        bodies = _joined(found, tracks, [])
+        if bodies is not None:
+            beside[f"fits/{kind}.npz"] = partial(write_bodies, bodies)
+    return dataclasses.replace(parts, beside=beside)
+
+
+def _with_pictures(
+    parts: Parts, lines: Sequence[Timeline], masks: Mapping[int, Instance | None], hints: Hints
+) -> Parts:
+    """The parts with all pictures, flipped left to right.
+
+    The reference image is the one with the fewest pixels of people (the paper: without human-object
+    occlusion), whose masks say where they are; without masks it is the first.
+    """
     from PIL import ImageOps
 
     beside = dict(parts.beside)
@@ -130,8 +152,16 @@ def _with_pictures(parts: Parts, lines: Sequence[Timeline], hints: Hints) -> Par
         beside[f"frames/{frame:06d}.jpg"] = partial(copy_whole, target)
     if not paths:
         return parts
-    load, size = image_parts(paths[0][2], mirrored=True)
-    return dataclasses.replace(parts, load_image=load, image_size=size, beside=beside)
+    _, frame, path = min(paths, key=lambda one: pixels_of(masks, one[1]))
+    load, size = image_parts(path, mirrored=True)
+    parts = dataclasses.replace(parts, load_image=load, image_size=size, beside=beside)
+    person, share = masks.get(frame), pixels_of(masks, frame) / (SIZE[0] * SIZE[1])
+    if person is not None:
+        hidden = with_reference_people(parts.people, Instances((person,), SIZE, path.name), Path())
+        parts = dataclasses.replace(parts, people=hidden)
+    said = f"has people on {share:.1%} of it" if frame in masks else "has no mask of people"
+    note = f"the reference image is frame {frame}, the emptiest: it {said}"
+    return dataclasses.replace(parts, notes=(*parts.notes, note))
 
 
 def _tracks(recordings: Sequence[Recording]) -> dict[str, int]:

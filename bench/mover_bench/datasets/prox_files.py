@@ -16,7 +16,8 @@ from jaxtyping import Bool
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
-from mover.core.types import Bodies, Camera
+from mover.core.types import Bodies, Camera, Masks
+from mover.geometry.rle import area
 from mover.geometry.rotations import affine
 from mover.io.files.fields import At, get, items, mapping, maybe, number, read_json, reason, refuse
 from mover.io.masks.instances import Instance, Instances, code_of, people_tree
@@ -42,6 +43,8 @@ Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 PAUSE = 60.0  # [s] between two videos of one capture: no person is tracked across it
 FITS = ("PROXD", "PROX", "fittings/PROXD", "fittings/PROX", "fittings/RGB")
 """Where fitted bodies may lie; the first that is there counts."""
+GIVEN_FITS = ("RGB", "PROX")
+"""Fits of the quantitative part that the paper compares with, in fittings/."""
 
 
 @dataclass(frozen=True)
@@ -191,20 +194,31 @@ NO_PEOPLE = 255
 MOST = 0.7  # of the picture that a person may fill
 
 
-def people_masks(
-    lines: Sequence[Timeline], tracks: Mapping[str, int], fps: float | None
-) -> At | None:
-    """The fields of people.json; None where no recording has masks; stills have no `fps`."""
-    items: list[Instance] = []
+def body_indices(
+    lines: Sequence[Timeline], tracks: Mapping[str, int]
+) -> dict[int, Instance | None]:
+    """The person in each frame that has a mask; None where there is no person in it."""
+    found: dict[int, Instance | None] = {}
     for line in lines:
         for frame, path in line.files("BodyIndexColor").items():
-            code = code_of(read_body_index(path))
-            if code is not None:
-                track = tracks[line.recording.subject]
-                items.append(Instance("person", None, code, frame=frame, track=track))
-    if not items:
-        return None
-    return people_tree(Instances(tuple(items), SIZE, "BodyIndexColor"), fps)
+            code, track = code_of(read_body_index(path)), tracks[line.recording.subject]
+            person = Instance("person", None, code, frame=frame, track=track)
+            found[frame] = None if code is None else person
+    return found
+
+
+def people_of(masks: Mapping[int, Instance | None], fps: float | None) -> At | None:
+    """The fields of people.json; None where no frame has a person; stills have no `fps`."""
+    items = tuple(person for person in masks.values() if person is not None)
+    return people_tree(Instances(items, SIZE, "BodyIndexColor"), fps) if items else None
+
+
+def pixels_of(masks: Mapping[int, Instance | None], frame: int) -> float:
+    """Pixels of people in a frame; infinite where it has no mask."""
+    person = masks.get(frame)
+    if person is None or person.mask is None:
+        return 0.0 if frame in masks else float("inf")
+    return float(area(Masks(SIZE[1], SIZE[0], (person.mask,)), 0))
 
 
 def read_body_index(path: Path) -> Bool[np.ndarray, "h w"]:

@@ -18,7 +18,8 @@ class ExperimentArgs:
     seeds: str = "0-9"
     """Which rooms: 0-9, or 0,3,5-7."""
     variants: tuple[str, ...] = ("robust", "paper")
-    """Presets, other variants, or lists of them: ablation, parts, terms, length, sensitivity.
+    """Presets, other variants, or lists of them: ablation, parts, terms, readings, length,
+    sensitivity.
     The first one is what the others are compared with."""
     out: Path = Path("experiments")
     """Folder for the results."""
@@ -50,11 +51,17 @@ class TableArgs:
     results: Annotated[Positional[Path], arg(metavar="RESULTS")]
     """Folder for the rows' results and the page."""
     preset: str = "robust"
-    """paper or robust."""
+    """paper, printed or robust."""
     detected: Path | None = None
     """The same captures with boxes and masks of a detector (PointRend), for rows of their own."""
     only: tuple[str, ...] = ()
     """Rows whose names begin so, as initial full; empty: all."""
+    steps: Annotated[int, int_in(0, 1_000_000)] = 0
+    """At most so many steps of each descent; 0: as many as the preset has."""
+    device: Literal["auto", "cpu", "cuda"] = "cpu"
+    """Where the heavy stages compute: a GPU shortens the steps of `paper` and `printed`."""
+    vposer: Path | None = None
+    """VPoser's weights: the table fits the baseline of the people itself, to the keypoints."""
     workers: Workers = 0
     """How many jobs run at once; 0: as many as there are cores."""
     look: bool = False

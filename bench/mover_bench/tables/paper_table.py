@@ -1,33 +1,50 @@
 """The paper's tables for a user's own copy of PROX and PiGraphs, beside the published rows.
 
-All rows are made by one command: jobs run beside each other, finished ones are files and are not
-done again, and what is finished so far is written as Markdown and CSV at every call.
+All rows are made by one command: jobs run beside each other, those whose stages others share
+first; finished ones are files and are not done again, and what is finished so far is written as
+Markdown and CSV at every call.
 """
 
 import csv
 import math
+import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from mover.core.errors import InputError
 from mover.core.files import replacing
 from mover.core.observe import Observer, Step, silent
+from mover.energy.config import Adam
 from mover.pipeline.presets import PRESETS
 from mover_bench.datasets import prox_files
 from mover_bench.experiment.args import TableArgs
 from mover_bench.experiment.job import read_numbers
 from mover_bench.experiment.run import Pool, run_each
 from mover_bench.experiment.tables import LOG, last_line, markdown
-from mover_bench.tables.rows import ERRORS, TABLES, PaperTable, Part, TableRow, variants
-from mover_bench.tables.table_job import DONE, TableJob, key_of
+from mover_bench.tables.rows import (
+    BASELINE,
+    ERRORS,
+    FITS,
+    INITIAL,
+    PLAIN,
+    STD,
+    TABLES,
+    PaperTable,
+    Part,
+    TableRow,
+    variants,
+)
+from mover_bench.tables.table_job import DONE, TableJob, fits_of, key_of
 
 MILLIMETRES = 1000.0
 SHORT = {
-    "iou3d": "IoU3D", "p2s": "P2S", "iou2d": "IoU2D", "non_collision": "NonCol",
+    "iou3d": "IoU3D", STD: "std", "p2s": "P2S", "iou2d": "IoU2D", "non_collision": "NonCol",
     "contact": "Cont.", "pitch_error": "pitch", "roll_error": "roll", "mean_tilt": "mean",
     "ground_penetration_frequency": "Freq.", "ground_penetration_distance": "Dist.",
     "pje": "PJE", "v2v": "V2V", "p_pje": "p.PJE", "p_v2v": "p.V2V",
 }  # fmt: skip
+FEW, JOB, STEP = 20.0, 60.0, 0.12
+"""[s] of one core: a job without a descent, one but for steps of Adam, and each of these steps."""
 Jobs = Mapping[TableRow, Sequence[TableJob]]
 
 
@@ -40,25 +57,65 @@ def paper_table(args: TableArgs, observe: Observer = silent, pool: Pool = run_ea
     Raises:
         InputError: If no capture has a truth, or the preset is none.
     """
+    table, jobs = TABLES[args.table], all_jobs(args)
+    every = _once(jobs)
+    waiting = [] if args.look else [job for job in every if not is_finished(job)]
+    for job in waiting:  # one without metrics.json has failed, and the page says so
+        (job.folder / DONE).unlink(missing_ok=True)
+    first = [job for job in waiting if job.name in (PLAIN, BASELINE)]  # others need their stages
+    done = len(every) - len(waiting)
+    for batch in (first, [job for job in waiting if job not in first]):
+        words = [(job.words, job.folder / LOG) for job in batch]
+        for index in pool("mover_bench.tables.table_job", words, args.workers):
+            observe(Step(f"{batch[index].capture.name}: {batch[index].name}", done, len(every)))
+            done += 1
+    return write_page(table, jobs, args)
+
+
+def all_jobs(args: TableArgs) -> Jobs:
+    """The jobs of each row that is asked for.
+
+    Raises:
+        InputError: If no capture has a truth, or the preset is none.
+    """
     if args.preset not in PRESETS:
         raise InputError(f"--preset: {args.preset!r} is none of {', '.join(PRESETS)}")
     table = TABLES[args.table]
     jobs = {row: jobs_of(row, args) for part in table.parts for row in asked(part, args)}
-    every = list(dict.fromkeys(job for found in jobs.values() for job in found))
-    if not every:
+    if not any(jobs.values()):
         where = f"{args.captures}/<name>/truth/scene.json"
         raise InputError(f"{args.captures}: has no capture of {table.title}, expected {where}")
-    waiting = [] if args.look else [job for job in every if not is_finished(job)]
-    for job in waiting:  # one without metrics.json has failed, and the page says so
-        (job.folder / DONE).unlink(missing_ok=True)
-    asked_jobs = [
-        ((str(job.capture), str(job.out), job.preset, job.name), job.folder / LOG)
-        for job in waiting
-    ]
-    ended = pool("mover_bench.tables.table_job", asked_jobs, args.workers)
-    for done, index in enumerate(ended, len(every) - len(waiting)):
-        observe(Step(f"{waiting[index].capture.name}: {waiting[index].name}", done, len(every)))
-    return write_page(table, jobs, args)
+    return {row: found for row, found in jobs.items() if found or not row.job.startswith(FITS)}
+
+
+def _once(jobs: Jobs) -> list[TableJob]:
+    return list(dict.fromkeys(job for found in jobs.values() for job in found))
+
+
+def planned(args: TableArgs) -> str:
+    """How many jobs there are, and about how long they take: as those that have ended, if any."""
+    every = _once(all_jobs(args))
+    waiting = [job for job in every if not is_finished(job)]
+    known = [read_numbers(job.folder / DONE).get("seconds") for job in every if job not in waiting]
+    times = [seconds for seconds in known if seconds is not None and seconds > FEW]
+    usual = statistics.mean(times) if times else None
+    hours = sum(_seconds(job, usual) for job in waiting) / 3600
+    basis = f"as the {len(times)} that have ended" if times else "as on an eight-object room"
+    return (
+        f"{len(every)} jobs of {len({job.capture for job in every})} captures, {len(waiting)} to"
+        f" do: about {hours:.1f} h of one core ({basis}); a GPU shortens Adam's steps alone"
+    )
+
+
+def _seconds(job: TableJob, usual: float | None) -> float:
+    """About how long a job takes on one core."""
+    if job.name == INITIAL or job.name.startswith(FITS):
+        return FEW
+    if usual is not None:
+        return usual
+    config = job.variant.config
+    methods = (config.layout.method, config.place.method)
+    return JOB + STEP * sum(m.steps for m in methods if isinstance(m, Adam))
 
 
 def asked(part: Part, args: TableArgs) -> list[TableRow]:
@@ -79,12 +136,14 @@ def jobs_of(row: TableRow, args: TableArgs) -> list[TableJob]:
     ]
     captures = args.detected if row.detected and args.detected is not None else args.captures
     out = args.results / "detected" if row.detected else args.results
-    return [
-        TableJob(path.parent.parent, out, args.preset, name)
+    vposer = "" if args.vposer is None else str(args.vposer)
+    found = [
+        TableJob(path.parent.parent, out, args.preset, name, args.steps, args.device, vposer)
         for path in sorted(captures.glob("*/truth/scene.json"))
         if belongs(path.parent.parent.name, args.table)
         for name in names
     ]
+    return [job for job in found if not job.name.startswith(FITS) or fits_of(job).is_file()]
 
 
 def belongs(name: str, table: str) -> bool:
@@ -102,11 +161,15 @@ def is_finished(job: TableJob) -> bool:
 
 def write_page(table: PaperTable, jobs: Jobs, args: TableArgs) -> Path:
     """The page and the numbers of what is finished."""
-    count = len({job.capture for found in jobs.values() for job in found})
-    lines = [f"# {table.title}", f"The paper has {table.expected}; here {count} of {table.count}."]
+    captures = {job.capture for found in jobs.values() for job in found}
+    pictures = sum(1 for home in captures for _ in home.glob("frames/*"))
+    have = f"here {len(captures)} of {table.count} captures, with {pictures} pictures"
+    lines = [f"# {table.title}", f"The paper has {table.expected}; {have}."]
+    lines += [f"At most {args.steps} steps of each descent."] if args.steps else []
     numbers: list[dict[str, str]] = []
     for part in table.parts:
-        filled = [(row, _values(row, jobs[row], part, table)) for row in asked(part, args)]
+        rows = [row for row in asked(part, args) if row in jobs]
+        filled = [(row, _values(row, jobs[row], part, table)) for row in rows]
         if not filled:
             continue
         lines += [f"## {part.title}", _laid_out(part, filled, table)]
@@ -143,6 +206,14 @@ def _values(
         if "pitch_error" in tree:
             tree.setdefault("mean_tilt", (tree["pitch_error"] + tree["roll_error"]) / 2)
     values: dict[str, float] = {"recordings": len({j.capture for j, tree in trees.items() if tree})}
+    spreads = [
+        statistics.stdev(known)
+        for home in dict.fromkeys(job.capture for job in jobs)
+        if len(known := [t["full"]["iou3d"] for j, t in trees.items() if t and j.capture == home])
+        > 1
+    ]
+    if STD in part.columns and spreads:
+        values[STD] = _scale(STD, table) * statistics.mean(spreads)
     for column in part.columns:
         known = [v for tree in found if math.isfinite(v := float(tree.get(column, math.nan)))]
         if known:

@@ -1,11 +1,13 @@
 """One job of a table: rebuild a capture of the user's as a row asks, and measure it.
 
-Each job is a process (`python -m mover_bench.tables.table_job CAPTURE OUT PRESET NAME`); jobs of a
-capture share its finished stages, and a finished job is a file under a digest of its inputs.
+Each job is a process (`python -m mover_bench.tables.table_job WORD ...`, see `TableJob.words`);
+jobs of a capture share its finished stages, and a finished job is a file under a digest of its
+inputs.
 """
 
 import json
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,13 +15,16 @@ from typing import Any
 
 import torch
 
+from mover.core.devices import Choice, device_of
+from mover.core.errors import InputError
 from mover.core.files import replacing
 from mover.core.records import fingerprint
 from mover.core.run import Run, sources
 from mover.core.types import Bodies, Capture, Scene, SceneObject
+from mover.evaluate.bodies import shared_rows
 from mover.evaluate.evaluation import EvaluateConfig, EvaluatedBodies, evaluate
 from mover.extensions import reconstruct
-from mover.io.capture.bodies_file import read_bodies
+from mover.io.capture.bodies_file import read_bodies, write_bodies
 from mover.io.capture.camera_file import camera_of
 from mover.io.capture.folder import read_capture
 from mover.io.capture.scene_file import read_scene
@@ -28,10 +33,11 @@ from mover.pipeline.result import to_world
 from mover.stages.config import RefineBodiesConfig
 from mover.stages.people.refine_bodies import ABLATION, refine_bodies
 from mover_bench.experiment.measures import under_camera
-from mover_bench.experiment.variants import withheld
-from mover_bench.tables.rows import PLAIN, variants
+from mover_bench.experiment.variants import Variant, withheld
+from mover_bench.tables.rows import BASELINE, FITS, INITIAL, PLAIN, at_most, variants
 
 DONE = "metrics.json"
+FITTED = "fitted.npz"
 BOXES = EvaluateConfig(boxes=True, feet="contacts")
 """The truth of both data sets is boxes; feet are those that touch the floor, as in the paper."""
 
@@ -46,6 +52,24 @@ class TableJob:
     preset: str
     name: str
     """A variant of `rows.variants`."""
+    steps: int = 0
+    """At most so many steps of each descent; 0: as many as the preset has."""
+    device: Choice = "cpu"
+    vposer: str = ""
+    """VPoser's weights: the bodies of the rows of people are fitted with them."""
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """The command line of its process."""
+        return (str(self.capture), str(self.out), self.preset, self.name, str(self.steps),
+                self.device, self.vposer)  # fmt: skip
+
+    @staticmethod
+    def of(words: Sequence[str]) -> "TableJob":
+        """The inverse of `words`."""
+        capture, out, preset, name, steps, device, vposer = words
+        choice: Any = device
+        return TableJob(Path(capture), Path(out), preset, name, int(steps), choice, vposer)
 
     @property
     def home(self) -> Path:
@@ -57,27 +81,54 @@ class TableJob:
         """Where its files are."""
         return self.home / self.name
 
+    @property
+    def variant(self) -> Variant:
+        """Its settings."""
+        return at_most(variants(self.preset)[self.name], self.steps)
+
 
 def key_of(job: TableJob) -> str:
-    """Digest of everything that a job's numbers depend on."""
+    """Digest of everything that a job's numbers depend on, but for the device."""
     files = [
         (path.relative_to(job.capture).as_posix(), path.stat().st_size, path.stat().st_mtime_ns)
         for path in sorted(job.capture.rglob("*"))
         if path.is_file() and path.parent.name != "frames"
     ]
-    settings = variants(job.preset)[job.name]
-    return fingerprint(settings, job.name, json.dumps(files), sources("mover_bench"))
+    settings, fitted = job.variant, job.vposer if job.variant.row else ""
+    return fingerprint(settings, job.name, fitted, json.dumps(files), sources("mover_bench"))
 
 
 def do_job(job: TableJob) -> None:
     """Rebuild, measure, and write metrics.json."""
-    variant = variants(job.preset)[job.name]
     given = read_capture(job.capture)
+    if job.name == INITIAL:
+        found = {"initial": measure(job.capture, given, given.scene, given.bodies)}
+    elif job.name.startswith(FITS):
+        people = read_bodies(fits_of(job))
+        camera = read_scene(job.capture / "truth" / "scene.json").camera
+        found = {"full": measure(job.capture, given, replace(given.scene, camera=camera), people)}
+    else:
+        found = rebuilt(job, given)
+    about = {"key": key_of(job), "seconds": time.process_time()}
+    with replacing(job.folder / DONE) as part:
+        part.write_text(json.dumps({**about, **found}, indent=1, allow_nan=False))
+
+
+def fits_of(job: TableJob) -> Path:
+    """The bodies that PROX's authors fitted, where the user's copy has them."""
+    return job.capture / "fits" / f"{job.name.removeprefix(FITS)}.npz"
+
+
+def rebuilt(job: TableJob, given: Capture) -> dict[str, Any]:
+    """The metrics of the room of a job, by stage."""
+    variant = job.variant
     if variant.change:
         scene = disturb(given.scene, variant.change, torch.Generator().manual_seed(0))
         given = replace(given, scene=scene)
+    if variant.row and job.vposer:
+        given = replace(given, bodies=fitted(job, given), touch=None)
     capture = withheld(given, variant.given, variant.cut)
-    room = reconstruct(capture, variant.config, Run(job.home))
+    room = reconstruct(capture, variant.config, Run(job.home, device=device_of(job.device)))
     if given.bodies is not None and (room.bodies is None or variant.cut is not None):
         room = under_camera(room, given, room.scene.camera)
     people = room.bodies
@@ -86,12 +137,39 @@ def do_job(job: TableJob) -> None:
         level = variant.row == "baseline"  # nothing of the room is known, not even where down is
         start = under_camera(room, capture, capture.scene.camera) if level else room
         people = refine_bodies(start, capture, weights).bodies
-    scenes = {"full": (room.scene, people)}
+    scenes = {"full": room.scene}
     if job.name == PLAIN:  # other jobs have no rows of these
-        scenes |= {"initial": (given.scene, given.bodies), "image": (room.image_only, people)}
-    measured = {name: measure(job.capture, given, *scene) for name, scene in scenes.items()}
-    with replacing(job.folder / DONE) as part:
-        part.write_text(json.dumps({"key": key_of(job), **measured}, indent=1, allow_nan=False))
+        scenes["image"] = room.image_only
+    return {name: measure(job.capture, given, scene, people) for name, scene in scenes.items()}
+
+
+def fitted(job: TableJob, given: Capture) -> Bodies:
+    """Bodies that are fitted to the capture's keypoints with the paper's terms and VPoser, once.
+
+    Raises:
+        InputError: If there are no keypoints, or the body model is not known.
+    """
+    from mover.bodies import load_model
+    from mover.fitting.bodies import FitInputs, fit_bodies
+    from mover.fitting.config import FITS as PRESETS_OF_FITS
+    from mover.fitting.prior import prior_of
+    from mover.io.people.found import Known
+    from mover.io.people.keypoints import keypoints_from
+
+    kept, pose = job.home / BASELINE / FITTED, given.bodies and given.bodies.pose
+    if kept.is_file():
+        return read_bodies(kept)
+    if pose is None:
+        raise InputError(f"{job.capture}: bodies.npz has no parameters, so the model is not known")
+    fps = None if given.bodies is None else given.bodies.fps
+    keypoints = keypoints_from("openpose", job.capture / "keypoints", Known(fps=fps))
+    model: Any = load_model(pose.model, pose.gender)
+    prior = prior_of(Path(job.vposer))
+    inputs = FitInputs(keypoints, given.scene.camera, model, prior=prior)
+    bodies = fit_bodies(inputs, PRESETS_OF_FITS["paper"]).bodies
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    write_bodies(bodies, kept)
+    return bodies
 
 
 def measure(
@@ -109,7 +187,8 @@ def measure(
         camera = camera_of(read_json(own)) if own.exists() else None
         true = read_scene(path / "scene.json", camera)
         there = path / "bodies.npz"
-        rows = EvaluatedBodies(None, people, read_bodies(there) if there.is_file() else None)
+        true_people = read_bodies(there) if there.is_file() else None
+        rows = EvaluatedBodies(None, people, true_people, named=named_contacts(capture, people))
         if name == "truth_scan":
             rows = EvaluatedBodies(None, None, None)
         values = evaluate(capture.scene, scene, true, rows, BOXES, ("result",))["result"]
@@ -119,6 +198,15 @@ def measure(
         elif "p2s" in values:
             found["p2s"] = values["p2s"]
     return found
+
+
+def named_contacts(capture: Capture, people: Bodies | None) -> torch.Tensor | None:
+    """The capture's contacts (POSA) of these bodies; None where some have none."""
+    if people is None or capture.bodies is None or capture.touch is None:
+        return None
+    rows, given = shared_rows(people, capture.bodies)
+    whole = len(rows) == len(people.frame) and people.verts.shape[1] == capture.touch.shape[1]
+    return capture.touch[given] if whole else None
 
 
 def disturb(scene: Scene, change: str, generator: torch.Generator) -> Scene:
@@ -140,9 +228,8 @@ def disturb(scene: Scene, change: str, generator: torch.Generator) -> Scene:
 
 def main(arguments: Sequence[str]) -> None:
     """Do the job that is named on the command line."""
-    capture, out, preset, name = arguments
     torch.set_num_threads(1)
-    do_job(TableJob(Path(capture), Path(out), preset, name))
+    do_job(TableJob.of(arguments))
 
 
 if __name__ == "__main__":

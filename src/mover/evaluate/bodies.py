@@ -14,6 +14,7 @@ from mover.core.types import Bodies, Camera
 from mover.evaluate.scene import Metric
 from mover.io.capture.pose_file import into_camera
 from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
+from mover.stages.config import FootContactConfig
 
 SOLES = ("left_sole", "right_sole")
 
@@ -93,15 +94,18 @@ def soles_of(bodies: Bodies, camera: Camera) -> Int[Tensor, " soles"]:
     return members(parts, *SOLES).nonzero()[:, 0]
 
 
-def feet_places(bodies: Bodies, camera: Camera) -> Float[Tensor, "points 1 3"]:
-    """Foot contacts in the world, estimated from the bodies: still, straight legs [m].
+def feet_places(
+    bodies: Bodies, camera: Camera, named: Float[Tensor, "bodies verts"] | None = None
+) -> Float[Tensor, "points 1 3"]:
+    """Foot contacts in the world [m]: soles among those that are named (paper: by POSA).
 
-    The paper takes contacts of POSA; these are estimated as `find_foot_contacts` does.
+    Where none are, those of still, straight legs, as `find_foot_contacts` estimates them.
     """
     R = camera.R_cam_world.to(bodies.verts)
     seen = into_camera(bodies, R)
     sound = torch.ones(len(bodies.frame), dtype=torch.bool)
-    feet = find_foot_contacts(FootContactInputs(seen, parts_of(seen, R[:, 1]), sound, camera))
+    inputs = FootContactInputs(seen, parts_of(seen, R[:, 1]), sound, camera, named)
+    feet = find_foot_contacts(inputs, FootContactConfig(given=True))
     return (feet.points_cam @ R)[:, None]
 
 

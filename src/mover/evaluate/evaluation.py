@@ -105,6 +105,8 @@ class EvaluatedBodies:
     truth: Bodies | None
     touch: TrueTouch | None = None
     """The true people beside the true furniture (`touch_in_truth`); None: it is measured."""
+    named: Float[Tensor, "bodies verts"] | None = None
+    """Chance that a vertex of `result` touches something (POSA), for feet that are contacts."""
 
 
 @record
@@ -163,7 +165,8 @@ def evaluate(
         near = gather_touch(judged.bodies, judged.furniture, touch, config.bodies, config.reach)
         feet = judged.bodies.verts[:, judged.soles] if len(judged.soles) else None
         if config.feet == "contacts":
-            feet = feet_places(judged.bodies, judged.scene.camera)
+            named = bodies.named if judged is after else None
+            feet = feet_places(judged.bodies, judged.scene.camera, named)
         return values | _people(
             judged.bodies, near, feet, judged.scene.ground, config.ground_tolerance, true.bodies
         )
