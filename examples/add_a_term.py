@@ -15,7 +15,7 @@ from torch import Tensor
 from mover.core.observe import Energy
 from mover.core.types import Layout
 from mover.energy.config import Adam
-from mover.energy.minimize import minimize, weigh
+from mover.energy.minimize import minimize
 from mover.energy.prior_terms import scale_term
 from mover.geometry.placement import place
 
@@ -37,10 +37,8 @@ def main() -> Layout:
     start = Layout(places, torch.tensor([[0.0, 0.0], [0.7, 0.7]]), torch.zeros(2, 2, 3))
 
     def energy(layout: Layout) -> Energy:
-        return weigh(
-            ("scale", 1.0, lambda: scale_term(layout.log_scale, "robust")),
-            ("behind", 10.0, lambda: behind_term(place(boxes, layout), WALL)),
-        )
+        scale = scale_term(layout.log_scale, "robust")
+        return Energy({"scale": scale, "behind": 10.0 * behind_term(place(boxes, layout), WALL)})
 
     found = minimize(energy, start, Adam(200, 0.02, 0.002), stage="two boxes")
     for name, values in energy(found.at).parts.items():

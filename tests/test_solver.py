@@ -16,7 +16,7 @@ from mover.core.types import Layout
 from mover.energy.bfgs import Problems, _step, minimize_batched
 from mover.energy.config import Adam, BatchedBFGS, SceneWeights
 from mover.energy.fused import energy as energy_warp
-from mover.energy.image_terms import squares
+from mover.energy.image_terms import silhouette_term
 from mover.geometry.camera import outermost, project, to_camera
 from mover.geometry.placement import place, place_in
 from mover.pipeline.presets import Config
@@ -321,7 +321,7 @@ class TestFasterTerms:
         free = torch.rand(2, 3, 24, 24, generator=r).double().requires_grad_()
         mask, keep = torch.rand(2, 3, 24, 24, generator=r).double().unbind()
         plain_ = ((free - mask).square() * (keep < 0.7)).sum((-2, -1))
-        fast = squares(free, mask, keep < 0.7)
+        fast = silhouette_term(free, mask, keep < 0.7, "paper")
         torch.testing.assert_close(fast, plain_)
         one, two = (torch.autograd.grad(p.square().sum(), free)[0] for p in (plain_, fast))
         torch.testing.assert_close(one, two)

@@ -10,7 +10,7 @@ from torch import Tensor
 from mover.core.errors import InputError
 from mover.core.records import rows_of
 from mover.core.types import Bodies, Capture
-from mover.pipeline.presets import PRESETS, Config
+from mover.pipeline.presets import PRESETS, READINGS, Config, literally
 from mover.stages.config import LensConfig, SpreadConfig
 from mover_bench.experiment.sets import CHANGES
 
@@ -97,6 +97,11 @@ LISTS: dict[str, dict[str, Variant]] = {
         "refined-people": Variant(ROBUST, refined=True),
     },
     "terms": {"paper": Variant(PRESETS["paper"]), **_subsets("paper", "paper-")},
+    "readings": {
+        "paper": Variant(PRESETS["paper"]),
+        "printed": Variant(PRESETS["printed"]),
+        **{f"literal {name}": Variant(literally(PRESETS["paper"], name)) for name in READINGS},
+    },
     "parts": {
         "robust": Variant(ROBUST),
         "no-refined-camera": Variant(replace(ROBUST, refine=replace(ROBUST.refine, rounds=0))),

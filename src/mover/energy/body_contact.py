@@ -1,11 +1,13 @@
-"""Skin that touches lies on a surface that faces it (after PROX); errors that last count once.
+"""Skin that touches lies on a surface that faces it (after PROX, contact term).
 
-An error that lasts says no more in a hundred frames than in one.
-
-Evidence:  signed distances that should be zero, in groups whose items share an error: of a part of
-           a person's skin over a piece that it touches.
-Cost:      the shared error in its usual size, and the rest of each distance without it. The shared
-           error is the one that is cheapest, in closed form (ridge mean with robust weights).
+Evidence:  for each skin point that touches, the nearest surface point whose normal is opposed to
+           the skin's within 45 degrees, and the plane there; found again as the body moves. Where
+           the distance to the furniture contradicts the plane, the surface ends before it.
+Cost:      Geman-McClure of the distance from the plane; the points of one group share one weight.
+           An error that a part of a person keeps over an object says no more in a hundred frames
+           than in one: it is taken out, and costs once in its usual size.
+Paper:     distance to the nearest vertex of the scene, normals up to their sign: a thigh inside a
+           seat may be drawn through it. Here the surface must face the skin, and one may slide.
 """
 
 import numpy as np
@@ -27,14 +29,9 @@ def without_kept(
 ) -> tuple[Float[Tensor, " items"], Float[Tensor, " items"]]:
     """What is left of distances without the error that their group shares, and its cost.
 
-    Args:
-        off: Signed distances [m].
-        trust: One over the variance of each alone [1/m²].
-        group: Which items share an error, from 0.
-        usual: Size of the shared error, of all groups or of each [m].
-
-    Returns:
-        The rest [m], and each item's share of the cost [nats].
+    The shared error, of a usual size [m], is the one that costs least (ridge mean); `trust` is one
+    over the variance of each distance alone [1/m²], and `group` counts from 0. The second is each
+    item's share of the cost [nats].
     """
     count = int(group.max()) + 1 if len(group) else 0
     total = off.new_zeros(count).index_add(0, group, trust)
@@ -43,22 +40,12 @@ def without_kept(
     return off - mean[group], 0.5 * (mean / usual).square()[group] * part
 
 
-# Skin that touches lies on a surface that faces it (after PROX, contact term).
-#
-# Evidence:  for each skin point that touches, the nearest surface point whose normal is opposed to
-#            the skin's within 45 degrees, and the plane there; found again as the body moves. Where
-#            the distance to the furniture contradicts the plane, the surface ends before it.
-# Cost:      Geman-McClure of the distance from the plane; the points of one group share one weight.
-# Paper:     distance to the nearest vertex of the scene, normals up to their sign: a thigh inside a
-#            seat may be drawn through it. Here the surface must face the skin, and one may slide.
-
-
 FACING = -0.7071  # cosine of 135 degrees, PROX's 45 degrees with the sign
 BEND = 0.15  # [m], how much a normal counts beside a place
 USUAL = 0.02  # [m], usual distance of skin that touches
 LAYER = 0.015  # [m], skin of a group that is no farther than this from its foremost point touches
 POINTS = 3.0  # independent places of a group that touches
-KEPT = 0.01  # [m], usual error that a part of a person has on one piece in all frames
+KEPT = 0.01  # [m], usual error that a part of a person has on one object in all frames
 LEAST_CHANCE = 0.5  # above it a point of the skin touches (the paper's threshold)
 REACH = 0.25  # [m], farther no surface is touched
 EDGE = 0.03  # [m], by which a plane and the furniture's own distance may differ
@@ -75,7 +62,7 @@ class Surface:
     piece: Int[Tensor, " points"]
     """Of the furniture, from 0."""
     uncertainty: Float[Tensor, " pieces"]
-    """Usual error of the place of each piece's surface, beside `KEPT` [m]."""
+    """Usual error of the position of each object's surface, beside `KEPT` [m]."""
 
 
 @record
@@ -115,7 +102,7 @@ class Matches:
     usual: Float[Tensor, " matches"]
     """Usual distance of skin that touches [m]."""
     kept: Int[Tensor, " matches"]
-    """Which share an error that lasts: one part of one person on one piece; from 0."""
+    """Which share an error that lasts: one part of one person on one object; from 0."""
     lasting: Float[Tensor, " kept"]
     """Usual size of each of these errors [m]."""
 
@@ -135,8 +122,9 @@ def gather_matches(skin: Skin, surface: Surface, furniture: Volume | None = None
     looks = _looks(facing, skin.chance[body, point], part)
     keep = ((facing * normal).sum(-1) < FACING) & ((looks * normal).sum(-1) < FACING)
     keep = keep & ((places - place).norm(dim=-1) < REACH)
-    if furniture is not None:
-        keep = keep & _on_surface(sample(furniture, places), off)
+    if furniture is not None:  # a plane still is the furniture's surface where the skin is
+        away = sample(furniture, places)
+        keep = keep & (((away - off).abs() < EDGE) | ((away < 0) & (off < 0)))
     body, point, place, normal, part, off, index = (
         x[keep] for x in (body, point, place, normal, part, off, index)
     )
@@ -169,13 +157,7 @@ def _nearest(
 def _looks(
     facing: Float[Tensor, "asked 3"], chance: Float[Tensor, " asked"], part: Int[Tensor, " asked"]
 ) -> Float[Tensor, "asked 3"]:
-    """Where the whole part looks: a thigh lies on the seat, and not on the seat's front.
-
-    Args:
-        facing: Normals of skin that touches.
-        chance: That it does.
-        part: Body and part of each.
-    """
+    """Where the whole part looks: a thigh lies on the seat, and not on the seat's front."""
     total = facing.new_zeros(int(part.max()) + 1, 3)
     total = total.index_add(0, part, facing * chance[:, None])
     return torch.nn.functional.normalize(total, dim=-1)[part]
@@ -189,25 +171,8 @@ def _shares(
     return POINTS * weight / total.index_add(0, part, weight)[part].clamp_min(POINTS)
 
 
-def _on_surface(
-    distance: Float[Tensor, " matches"], off: Float[Tensor, " matches"]
-) -> Bool[Tensor, " matches"]:
-    """Whether a plane still is the surface of the furniture where the skin is.
-
-    Args:
-        distance: Of the skin from the furniture, negative inside [m].
-        off: Of the skin from the plane [m].
-    """
-    return ((distance - off).abs() < EDGE) | ((distance < 0) & (off < 0))
-
-
 def _foremost(off: Float[Tensor, " matches"], group: Int[Tensor, " matches"]) -> Tensor:
-    """1 for the skin of each group that reaches farthest: what is round touches little.
-
-    Args:
-        off: Distance from the plane, negative inside [m].
-        group: Body and part of each match.
-    """
+    """1 for the skin of each group that reaches farthest: what is round touches little."""
     least = off.new_full((int(group.max()) + 1 if len(group) else 1,), torch.inf)
     least = least.scatter_reduce(0, group, off, "amin")[group]
     return (off < least + LAYER).to(off)

@@ -6,11 +6,9 @@ r"""Terms of the energy of bodies: E_Body of `mover fit`, and the refinement in 
     L_smooth = Σ_t ρ(|J_{t-1} + J_{t+1} - 2 J_t|; σ2) + ρ(|π(J_{t-1}) + π(J_{t+1}) - 2 π(J_t)|; σ3)
 
 after Pavlakos et al. 2019 (SMPLify-X, Sec. 3.2 and its published configuration) and the paper;
-ρ(r; σ) = σ² r² / (r² + σ²), for keypoints on each coordinate. The refinement keeps bodies near to
-what was given (angles, image, range), smooth in time (smooth, steady, lock), in the room (under,
-stand, sink; after PROX), in the order of depths (order) and on their masks (outline), in nats; skin
-that touches stands in `body_contact`. All return one value for each body; `body_energy` lists them.
-Self-collision is left out, as in the authors' video configuration.
+ρ(r; σ) = σ² r² / (r² + σ²), for keypoints on each coordinate; self-collision is left out, as in the
+authors' video configuration. The terms of the refinement (under, stand, sink after PROX) are in
+nats. All return one value for each body; `body_energy` lists them.
 """
 
 import torch
@@ -50,13 +48,10 @@ def keypoint_term(
 
 # --- Near to what was given: the prior of the refinement -----------------------------------------
 #
-# Evidence:  the bodies as they were given, whose pose is wrong by a few degrees, whose depth is
-#            wrong by a few percent, and which cover the right pixels.
-# Cost:      half the squared change over its usual size, in nats: of the joints' angles, of the
-#            depth, and of the place in the image (robust, in metres at the body's depth), but for
-#            the size there.
-# Departure: The paper fits the pose to the image again (SMPLify-X's terms). Here the first fit is
-#            the datum, so that bodies of any source, meshes too, can be refined.
+# Half the squared change over its usual size, in nats: of the joints' angles, of the depth, and of
+# the position in the image (robust, in metres at the body's depth), but for the size there. The
+# paper fits the pose to the image again (SMPLify-X's terms); here the first fit is the datum, so
+# that bodies of any source, meshes too, can be refined.
 
 ANGLE = 0.09  # [rad], 5 degrees: usual error of a joint
 BIAS = 0.03  # usual error of a person's depth in all frames, as a share
@@ -98,7 +93,7 @@ def image_term(
 ) -> Float[Tensor, " bodies"]:
     """Cost of leaving the pixels where the joints were seen.
 
-    A body that moves along the ray of its pelvis pays nothing for its size in the image: its size
+    A body that moves along the ray of its pelvis costs nothing for its size in the image: its size
     is known no better than its depth, in all frames.
 
     Args:
@@ -117,15 +112,10 @@ def image_term(
 
 # --- Time: people move smoothly, and errors last -------------------------------------------------
 #
-# Evidence:  rows of one track at most a second apart.
-# Cost:      motion: rho(second difference of x), x the joints, their projections or the pelvis,
-#            over what people do in that time; Geman-McClure.
-#            steady: change between two frames of what was changed: an error of pose or depth does
-#            not come and go. lock: way of a sole at rest between two frames.
-# Paper:     second differences at the video's rate, whatever it is (L_smooth).
-# Departure: they are taken over real time, so that gaps and frame rates make no acceleration. A fit
-#            divides those of 3D joints by the size of the body: most of them is noise of the
-#            keypoints, which is longer in metres the larger and the farther the body is estimated.
+# Rows of one track at most a second apart. Second differences are taken over real time (paper: at
+# the video's rate), so that gaps and frame rates make no acceleration. A fit divides those of 3D
+# joints by the size of the body: most of them is noise of the keypoints, which is longer in metres
+# the larger and the farther the body is estimated.
 
 GAP = 1.0  # [s], longer nothing is known about the way between two frames
 TREMBLE = 0.02  # [m], second difference of a body that is fitted frame by frame
@@ -241,13 +231,9 @@ def _per_row(cost: Float[Tensor, " items"], row: Int[Tensor, " items"], rows: in
 
 # --- Room: bodies do not sink into it, and feet stand on its floor -------------------------------
 #
-# Evidence:  the signed distance to all furniture on one grid, and the floor's height.
-# Cost:      sink:  rho(depth of the skin inside furniture), summed over even points of the skin
-#            under: the same below the floor, of the deepest points
-#            stand: Geman-McClure of the height of soles at rest over the floor
-# Paper:     the sum of the depths, of all vertices. Here a squared cost up to 2 cm, because skin
-#            and cushions give way, and a linear one beyond; and points of the skin share one body's
-#            weight, so that the resolution of the mesh has none.
+# The paper sums the depths of all vertices. Here a squared cost up to 2 cm, because skin and
+# cushions give way, and a linear one beyond; and points of the skin share one body's weight, so
+# that the resolution of the mesh has none.
 
 SOFT = 0.02  # [m], as far skin gives way
 SKIN_POINTS = 80.0  # places of the skin that count, of all that are looked at
@@ -296,12 +282,10 @@ def _dent(depth: Float[Tensor, "bodies points"]) -> Float[Tensor, " bodies"]:
 
 # --- Depth order: who hides whom bounds the depth of people --------------------------------------
 #
-# Evidence:  the furniture of the estimated room is drawn once. Skin that faces the camera and is
-#            seen (inside the person's visible mask) before a piece of furniture is not farther
-#            than its front; skin that a piece hides (inside the mask of that piece, outside of all
-#            people) is not nearer than its front.
-# Cost:      how far the skin is out of these bounds, less a margin, at most half a metre.
-# Paper:     L_depth moves objects between people; the refinement of the bodies does not name it.
+# The furniture of the estimated room is drawn once. Skin that faces the camera and is seen (inside
+# the person's visible mask) before an object is not farther than its front; skin that an object
+# hides (inside its mask, outside of all people) is not nearer than its front. The refinement of the
+# paper does not name this term.
 
 ORDER_MARGIN = 0.03  # [m], outlines and fronts are not known better
 ORDER_MOST = 0.5  # [m], beyond, something else is wrong
@@ -328,7 +312,7 @@ class Sighting:
     shown: Bool[Tensor, "bodies points"]
     """Well inside the person's visible mask."""
     hidden: Bool[Tensor, "bodies points"]
-    """Well outside everybody's masks, inside the mask of the furniture that is drawn there."""
+    """Well outside the masks of people, inside the mask of the furniture that is drawn there."""
     facing: Bool[Tensor, "bodies points"]
     """The skin faces the camera."""
     loose: Float[Tensor, "bodies points"]
@@ -358,14 +342,10 @@ def order_term(depth: Float[Tensor, "bodies points"], bounds: Bounds) -> Float[T
 
 # --- Outlines: the outline of a body lies on that of its mask ------------------------------------
 #
-# Not in the paper, whose refinement of bodies knows keypoints only.
-#
-# Evidence:  points of the drawn body's outline where nothing else can end the person's mask; for
-#            each the skin next to it, the outline's normal, and how far the mask's outline is from
-#            it.
-# Cost:      Geman-McClure of that distance along the normal, in usual errors of masks; the points
-#            of one body share a weight. A mask that is too wide all around says nothing: that much
-#            is taken out of the distances.
+# Points of the drawn body's outline where nothing else can end the person's mask; for each the skin
+# next to it, the outline's normal, and how far the mask's outline is from it. Points of one body
+# share a weight. A mask that is too wide all around says nothing: that much is taken out of the
+# distances. Not in the paper, whose refinement of bodies knows keypoints only.
 
 OUTLINE_BORDER = 0.0025  # [image widths], usual error of an outline that is not the same all around
 OUTLINE_TAIL = 3.0  # usual errors at which the cost is half of the most

@@ -47,6 +47,26 @@ def only(**weights: float) -> SceneWeights:
 
 
 @dataclass(frozen=True)
+class Readings:
+    """How the form `paper` reads what its formulas leave open; preset `printed`: the last values.
+
+    See "Readings of the paper" in docs/method.md.
+    """
+
+    silhouette: Literal["exact", "renderer"] = "exact"
+    """The gradient of L_occ-sil: exact, or as steep as the renderer's of lambda_2."""
+    contradiction: Literal["skip", "count"] = "skip"
+    """Pixels whose near bound is beyond the far one have no range, or two costs."""
+    surface: Literal["samples", "vertices"] = "samples"
+    """u of L_collision: even samples that count as 1000, or the proxy's vertices."""
+    lookup: Literal["trilinear", "voxel"] = "trilinear"
+    """V at u, or of the voxel of u (whose gradient would be none: it is the trilinear one)."""
+    contact: Literal["mean", "sum", "components"] = "mean"
+    """L_contact: a mean over the skin that touches, the sum, or the sum of the y component of the
+    distance to the top and the others of that to the back."""
+
+
+@dataclass(frozen=True)
 class SceneConfig:
     """How the terms of the room are weighted."""
 
@@ -55,6 +75,7 @@ class SceneConfig:
     """As printed, or normalised and robust."""
     growth: Weight = GROWTH
     """Cost of another size as a whole, against that of another shape (robust only)."""
+    readings: Readings = field(default_factory=Readings)
 
 
 @dataclass(frozen=True)
@@ -99,68 +120,37 @@ class BatchedBFGS:
 class BodyWeights:
     """How much each term of the energy of bodies counts; 0: it is left out."""
 
-    keypoints: Weight = 0.0
-    """E_Body: projected keypoints off the detected ones."""
-    smooth_joints: Weight = 0.0
-    """L_smooth: second differences of 3D joints, over the acceleration that people have."""
-    smooth_pixels: Weight = 0.0
-    """L_smooth: second differences of projections; confidence of the middle frame counts."""
-    still: Weight = 0.0
-    """The pelvis, which does not move where its picture does not."""
-    held: Weight = 0.0
-    """Trunk, head and arms about the pelvis, where they look still."""
-    support: Weight = 0.0
-    """Points under the floor of a fit."""
-    stands: Weight = 0.0
-    """Lower soles of all bodies off one floor that is found with them."""
-    balance: Weight = 0.0
-    """Centres of mass of standing bodies that are not over their feet."""
-    level: Weight = 0.0
-    """Slopes of the floor that is found."""
-    lies: Weight = 0.0
-    """Distance before and after lying, for people lying along the view."""
-    pose: Weight = 0.0
-    """The pose off the usual one, or the code of a learned prior."""
-    limits: Weight = 0.0
-    """Ranges of motion."""
-    bending: Weight = 0.0
-    """Elbows and knees bent the wrong way."""
-    shape: Weight = 0.0
-    """Proportions, and the stature of people of unknown height."""
-    height: Weight = 0.0
-    """A given height."""
-    offset: Weight = 0.0
-    """Lasting offsets of a detector's keypoints."""
-    hands: Weight = 0.0
-    """Usual hands."""
-    jaw: Weight = 0.0
-    """The jaw's opening; its other turns cost a hundred times as much."""
-    expression: Weight = 0.0
-    """Usual faces."""
-    angles: Weight = 0.0
-    """Refinement, in nats: distance of all angles from those that were given."""
-    image: Weight = 0.0
-    """Distance of the joints from where they were seen."""
-    range: Weight = 0.0
-    """Change of the depth."""
-    smooth: Weight = 0.0
-    """E_smooth: joints between their neighbours in time."""
-    steady: Weight = 0.0
-    """Corrections that come and go."""
-    under: Weight = 0.0
-    """CamGP: skin below the floor."""
-    stand: Weight = 0.0
-    """CamGP: soles at rest off the floor."""
-    lock: Weight = 0.0
-    """CamGP: soles at rest that slide."""
-    sink: Weight = 0.0
-    """SDF: skin inside furniture."""
-    touch: Weight = 0.0
-    """Contact: skin that touches, off the furniture."""
-    order: Weight = 0.0
-    """Depth order: skin in front of its occluder, or behind furniture that it occludes."""
-    outline: Weight = 0.0
-    """Masks: the outline of the body on the outline of its mask."""
+    keypoints: Weight = 0.0  # E_Body: projected keypoints off the detected ones
+    smooth_joints: Weight = 0.0  # L_smooth: of 3D joints, over people's acceleration
+    smooth_pixels: Weight = 0.0  # L_smooth: of projections, by the middle's confidence
+    still: Weight = 0.0  # the pelvis, which does not move where its picture does not
+    held: Weight = 0.0  # trunk, head and arms about the pelvis, where they look still
+    support: Weight = 0.0  # points under the floor of a fit
+    stands: Weight = 0.0  # lower soles of all bodies off one floor that is found with them
+    balance: Weight = 0.0  # centres of mass of standing bodies that are not over their feet
+    level: Weight = 0.0  # slopes of the floor that is found
+    lies: Weight = 0.0  # distance before and after lying, for people lying along the view
+    pose: Weight = 0.0  # the pose off the usual one, or the code of a learned prior
+    limits: Weight = 0.0  # ranges of motion
+    bending: Weight = 0.0  # elbows and knees bent the wrong way
+    shape: Weight = 0.0  # proportions, and the stature of people of unknown height
+    height: Weight = 0.0  # a given height
+    offset: Weight = 0.0  # lasting offsets of a detector's keypoints
+    hands: Weight = 0.0  # usual hands
+    jaw: Weight = 0.0  # the jaw's opening; its other turns cost a hundred times as much
+    expression: Weight = 0.0  # usual faces
+    angles: Weight = 0.0  # refinement, in nats: distance of all angles from those that were given
+    image: Weight = 0.0  # distance of the joints from where they were seen
+    range: Weight = 0.0  # change of the depth
+    smooth: Weight = 0.0  # E_smooth: joints between their neighbours in time
+    steady: Weight = 0.0  # corrections that come and go
+    under: Weight = 0.0  # CamGP: skin below the floor
+    stand: Weight = 0.0  # CamGP: soles at rest off the floor
+    lock: Weight = 0.0  # CamGP: soles at rest that slide
+    sink: Weight = 0.0  # SDF: skin inside furniture
+    touch: Weight = 0.0  # contact: skin that touches, off the furniture
+    order: Weight = 0.0  # depth order: skin before its occluder, or behind what it occludes
+    outline: Weight = 0.0  # masks: the outline of the body on the outline of its mask
 
 
 REFINE = BodyWeights(

@@ -7,7 +7,7 @@ r"""Terms of Eq. 1 that people say of the room: depth order, free space, contact
                                                            + CD(v^{\perp y}, C(O_i)^{\perp y})]
     Feet         L_feet      = \rho(R^T C^feet - [0, y_gp, 0]^T; \sigma_1)
 
-Sec. 3.1 and 3.2 of the paper: as printed (`paper`), and normalised and robust (`robust`).
+Sec. 3.1 and 3.2 of the paper: as printed (`paper`, with its `Readings`), and normalised (`robust`).
 """
 
 from dataclasses import fields
@@ -27,12 +27,9 @@ from mover.geometry.volume import Volume, sample
 
 # --- Depth order: who hides whom bounds the depth ------------------------------------------------
 #
-# far(p) = min_t D_far^t(p), near(p) = max_t D_near^t(p), gathered once over all frames: where a
-# person is seen in front of object i (p in M_i, Sil_t and M_t), the object is not nearer than where
-# the ray leaves the body; where object i hides the person (p in M_i and Sil_t, not in M_t), it is
-# not farther than where the ray would enter the body.
-# Departure: the near bound is the first exit of the ray from the visible body, not the farthest
-# layer of the body, which would forbid true positions (an arm in front of a chair).
+# Where a person is seen in front of object i (p in M_i, Sil_t and M_t), the object is not nearer
+# than where the ray leaves the body; where object i hides the person (p in M_i and Sil_t, not in
+# M_t), it is not farther than where the ray would enter the body.
 
 CLAMP = 2.0  # [m], the authors' released code
 DEPTH_MARGIN = 0.02  # [m], slack of the robust form
@@ -66,7 +63,7 @@ class BodyView:
     front: Float[Tensor, "h w"]
     """Depth where the ray enters the body [m]; inf where it misses."""
     exit: Float[Tensor, "h w"]
-    """Depth where it first leaves the body [m]."""
+    """Depth where it first leaves the body, or of the body's far side [m]."""
     visible: Bool[Tensor, "h w"]
     """The person's visible mask."""
     others: Bool[Tensor, "h w"]
@@ -75,16 +72,17 @@ class BodyView:
     """How far the drawn outline may be wrong [px]."""
 
 
-def bounds_of(seen: BodyView, objects: Bool[Tensor, "objects h w"], erode: int) -> DepthMaps:
+def bounds_of(
+    seen: BodyView, objects: Bool[Tensor, "objects h w"], erode: int, vote: bool = True
+) -> DepthMaps:
     """Bounds from one body in one frame.
-
-    Of each object only the larger region counts: it is hidden or hides, not both.
 
     Args:
         seen: The drawn body and the masks.
         objects: Masks of the objects in the clean image.
         erode: Pixels by which silhouettes and masks shrink, so that rays that graze the body and
             borders that leak bound nothing.
+        vote: Of each object only the larger region counts: it is hidden or hides, not both.
     """
     body = eroded(seen.front.isfinite(), erode)
     shown = body & eroded(seen.visible, erode)
@@ -92,10 +90,12 @@ def bounds_of(seen: BodyView, objects: Bool[Tensor, "objects h w"], erode: int) 
     if seen.reach > 0:
         hidden = _thick(hidden, seen.reach)
     before, behind = objects & shown, objects & hidden
-    more = (before.sum((-2, -1)) - behind.sum((-2, -1)))[:, None, None]
+    if vote:
+        more = (before.sum((-2, -1)) - behind.sum((-2, -1)))[:, None, None]
+        before, behind = before & (more > 0), behind & (more < 0)
     infinity = torch.full_like(seen.front, float("inf"))
-    near = torch.where((before & (more > 0)).any(0), seen.exit, -infinity)
-    return DepthMaps(near, torch.where((behind & (more < 0)).any(0), seen.front, infinity))
+    near = torch.where(before.any(0), seen.exit, -infinity)
+    return DepthMaps(near, torch.where(behind.any(0), seen.front, infinity))
 
 
 def merge(a: DepthMaps, b: DepthMaps) -> DepthMaps:
@@ -104,12 +104,16 @@ def merge(a: DepthMaps, b: DepthMaps) -> DepthMaps:
 
 
 def depth_term(
-    seen: Depths, mask: Float[Tensor, "objects h w"], allowed: DepthRange, form: Variant
+    seen: Depths,
+    mask: Float[Tensor, "objects h w"],
+    allowed: DepthRange,
+    form: Variant,
+    contradiction: str = "skip",
 ) -> Float[Tensor, "*starts objects"]:
     """Distance of the front surface out of the allowed range [m px at 640], or its mean [m].
 
-    Paper: the sum over pixels; where the bounds contradict each other there is no range, and the
-    pixel says nothing. Robust: the mean over the constrained pixels, with 2 cm slack, clamped.
+    Paper: the sum over pixels; bounds that contradict each other are no range, unless they `count`.
+    Robust: the mean over the constrained pixels, with 2 cm slack, clamped.
     """
     inside = seen.covered & (mask > 0.5)
     if form == "robust":
@@ -118,7 +122,7 @@ def depth_term(
         out = _short(allowed.near - DEPTH_MARGIN, seen.nearest, CLAMP)
         out = out + _short(seen.nearest, allowed.far + DEPTH_MARGIN, CLAMP)
         return (out * bounded).sum((-2, -1)) / bounded.sum((-2, -1)).clamp_min(FEWEST)
-    ranged = inside & (allowed.near <= allowed.far)
+    ranged = inside if contradiction == "count" else inside & (allowed.near <= allowed.far)
     out = _short(allowed.near, seen.nearest) + _short(seen.nearest, allowed.far)
     return (out * ranged).sum((-2, -1)) * allowed.area
 
@@ -132,10 +136,7 @@ def _short(
 
 
 def _thick(hidden: Bool[Tensor, "h w"], reach: float) -> Bool[Tensor, "h w"]:
-    """What a wrong outline does not explain: discs of the radius `reach` that are wholly hidden.
-
-    An arm that the body has in a wrong position is not hidden by what stands behind it.
-    """
+    """What a wrong outline does not explain: discs of the radius `reach` that are wholly hidden."""
     from scipy.ndimage import distance_transform_edt
 
     inner = torch.from_numpy(distance_transform_edt(hidden.cpu().numpy())) > reach
@@ -145,10 +146,7 @@ def _thick(hidden: Bool[Tensor, "h w"], reach: float) -> Bool[Tensor, "h w"]:
 
 
 def eroded(mask: Bool[Tensor, "*batch h w"], steps: int) -> Bool[Tensor, "*batch h w"]:
-    """The mask without pixels that lie so many steps (of four neighbours) from an unset one.
-
-    The border of the image is no edge.
-    """
+    """The mask without pixels so many steps from an unset one; the image's border is no edge."""
     for _ in range(steps):
         padded = torch.nn.functional.pad(mask, (1, 1, 1, 1), value=True)
         rows = padded[..., :-2, 1:-1] & padded[..., 2:, 1:-1]
@@ -158,10 +156,7 @@ def eroded(mask: Bool[Tensor, "*batch h w"], steps: int) -> Bool[Tensor, "*batch
 
 # --- Free space: people move through it -----------------------------------------------------------
 #
-# V = min(V_1, ..., V_T) is the signed distance to all bodies on one grid [m]. In the paper u are
-# the vertices of a mesh that marching cubes made lie evenly on it, and how many they are is not
-# printed: here even surface samples, whose sum counts as that of 1000, as many as the authors'
-# code draws. So the resolution of a mesh has no weight.
+# V = min(V_1, ..., V_T) is the signed distance to all bodies on one grid [m].
 
 SAMPLES = 1000.0  # of an object in the authors' code; 3 cm inside on each costs one
 
@@ -175,19 +170,33 @@ class BodySpace:
 
 
 def collision_term(
-    points: Float[Tensor, "*starts objects points 3"], space: BodySpace
+    points: Float[Tensor, "*starts objects points 3"],
+    space: BodySpace,
+    lookup: str = "trilinear",
+    real: Bool[Tensor, "objects points"] | None = None,
 ) -> Float[Tensor, "*starts objects"]:
-    """Squared depth of even surface samples inside the bodies of all frames [m²]."""
-    depth = sample(space.volume, points).clamp_max(0)
-    return SAMPLES * depth.square().mean(-1)
+    """Squared depth of surface points inside the bodies of all frames [m²].
+
+    Even samples count as `SAMPLES`; vertices are those that are `real`, one each.
+    """
+    depth = sample(space.volume, points)
+    if lookup == "voxel":
+        depth = depth + (_voxel(space.volume, points) - depth).detach()
+    squared = depth.clamp_max(0).square()
+    return SAMPLES * squared.mean(-1) if real is None else (squared * real).sum(-1)
+
+
+def _voxel(volume: Volume, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+    """The value of the cell that holds a point; 0 beyond the volume."""
+    size = torch.tensor(volume.values.shape, device=points.device)
+    at = ((points - volume.origin) / volume.cell).round().long()
+    inside = ((at >= 0) & (at < size)).all(-1)
+    x, y, z = torch.minimum(at.clamp_min(0), size - 1).unbind(-1)
+    return volume.values[x, y, z] * inside
 
 
 def collision_share(objects: Objects, touches: "ContactPoints | None") -> Float[Tensor, " objects"]:
-    """Weight of the collision of each object: a tenth for a seat that is used (`robust` only).
-
-    A body is soft and the shape of a seat is often wrong: the body of the sitter then lies inside
-    the mesh, and the seat would flee.
-    """
+    """Weight of the collision of each object: a tenth for a used seat, as bodies are soft."""
     if touches is None:
         return objects.verts.new_ones(len(objects.ids))
     used = objects.verts.new_zeros(len(objects.ids)).index_fill(0, touches.object_of, 1.0)
@@ -198,13 +207,8 @@ def collision_share(objects: Objects, touches: "ContactPoints | None") -> Float[
 #
 # Body points that touch, from all frames, are each assigned to one object and to its part: to the
 # seat or top (C(O)^y) if their normal lies within 45 degrees of the vertical, else to the back;
-# thinned to small cells whose weight counts the points inside.
-# Paper:  CD is a mean over its source points, which the sum prints: all touching skin of the
-#         people, of which I(v, O_i) picks what touches this object. So what many bodies touch
-#         weighs more than what a few stray vertices touch. Body and hands together.
-# Robust: the mean of a Geman-McClure cost from body to object, in full only once four bodies touch,
-#         the back a quarter of the seat; so that contact neither drags an object by a few wrong
-#         points nor rules its size. `heading_term` turns seats and beds with their people.
+# thinned to cells whose weight counts the points inside. Robust: in full once four bodies touch,
+# the back a quarter of the seat, so that a few wrong points do not drag an object.
 
 CONTACT_RHO = 0.3  # [m], docs/method.md: 0.15 gives up on objects half a metre away
 ENOUGH = 4.0  # bodies that touch before contact counts in full
@@ -250,24 +254,33 @@ def some_touches(touches: ContactPoints, index: Int[Tensor, " few"], count: int)
 
 
 def contact_distance(
-    layout: Layout, objects: Objects, touches: ContactPoints
+    layout: Layout, objects: Objects, touches: ContactPoints, components: bool = False
 ) -> Float[Tensor, "*starts touched 4 points"]:
     """Distance from each body point to the nearest point of the part that it touches [m].
 
-    The pairing has no gradient.
+    Or, by `components`, the vertical distance to the nearest point of the top and the horizontal
+    one to that of the back, if there is one. The pairing has no gradient.
     """
     index = touches.object_of
     t, scale = layout.t_world_object[..., index, :].unsqueeze(-2), layout.log_scale[..., index, :]
     turn, scale = rot_y(layout.yaw[..., index]), scale.exp()
     found: list[Tensor] = []
     for k, region in enumerate((objects.top[index], objects.back[index])):
-        query = touches.points[:, k::2].flatten(1, 2)  # of the body, then of the hands
+        asking = touches.points if components else touches.points[:, k::2]
+        query = asking.flatten(1, 2)  # of the body, then of the hands
         own, points = (query - t) @ turn, region * scale.unsqueeze(-2)
         exact = "donot_use_mm_for_euclid_dist"
         pair = torch.cdist(own.detach(), points.detach(), compute_mode=exact).argmin(-1)
         pairs = pair.unsqueeze(-1).expand(*pair.shape, 3)
         chosen = region.expand(*pair.shape[:-1], -1, 3).gather(-2, pairs)
-        found.append(safe_norm(query - (chosen * scale.unsqueeze(-2)) @ turn.mT - t))
+        gap = query - (chosen * scale.unsqueeze(-2)) @ turn.mT - t
+        if components:
+            axes = constant((1.0, 0.0, 1.0) if k else (0.0, 1.0, 0.0), gap)
+            there = objects.has_back[index] if k else torch.ones_like(objects.has_back[index])
+            gap = gap * axes * there[:, None, None]
+        found.append(safe_norm(gap))
+    if components:
+        return (found[0] + found[1]).unflatten(-1, (4, -1))
     both = torch.stack(found, -2).unflatten(-1, (2, -1))  # region, body or hand
     return both.transpose(-3, -2).flatten(-3, -2)
 
@@ -277,14 +290,17 @@ def contact_term(
     touches: ContactPoints,
     objects: int,
     form: Variant,
+    contact: str = "mean",
 ) -> Float[Tensor, "*starts objects"]:
     """Mean distance of body points from the parts that they touch.
 
-    Over all touching skin (`paper`) [m], or over that of the part, bounded (`robust`) [1].
+    Over all touching skin or, unless `contact` is a mean, its sum (`paper`) [m]; or over that of
+    the part, bounded (`robust`) [1].
     """
     weight = touches.weight.sum(-1).clamp_min(1e-9)
     if form == "paper":
-        cost = ((distance * touches.weight).sum(-1) / weight * touches.share).sum(-1)
+        cost = (distance * touches.weight).sum(-1)
+        cost = (cost / weight * touches.share if contact == "mean" else cost).sum(-1)
     else:
         mean = (geman_mcclure(distance, CONTACT_RHO) * touches.weight).sum(-1) / weight
         cost = (mean * constant(CONTACT_SHARE, distance)).sum(-1)
@@ -307,11 +323,8 @@ def heading_term(layout: Layout, touches: ContactPoints) -> Float[Tensor, "*star
 
 # --- Feet at rest stand on the ground -------------------------------------------------------------
 #
-# Reading:   as printed, rho would act on the sum of all points, and on x and z as well, which no
-#            floor bounds. Here rho acts on each point, as in the authors' code, and only on its
-#            height.
-# Departure: each person may float or sink by one offset, which absorbs a wrong depth of the body; a
-#            weak prior keeps the tilt that the feet cannot constrain where the first guess had it.
+# Each person may float or sink by one offset, which absorbs a wrong depth of the body (robust); a
+# weak prior keeps the tilt that the feet cannot constrain where the first guess had it.
 
 TILT_TAIL = 2.0  # degrees of freedom of the prior of the tilt, which forgives large changes
 

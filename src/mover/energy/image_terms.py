@@ -6,17 +6,16 @@ r"""Terms of Eq. 1 that the image says: boxes, silhouettes, borders of masks, me
                               + \lambda_2 (L_occ-sil(\delta) + \rho \delta^2)
     Depth map    L_measured = \sum_i mean_{p in Sil_i, M_i} 2 \log(1 + \delta^2 / 3 \sigma^2)
 
-The first two are of the supplement ("Loss Terms") and Sec. 3.1 (after PHOSA), as printed (`paper`)
-and normalised (`robust`); the others are not in the paper.
+The first two are of the supplement ("Loss Terms") and Sec. 3.1 (after PHOSA), the others are not in
+the paper. `paper` has the printed form with its `Readings`, `robust` a normalised one.
 """
 
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from mover.core.devices import constant
 from mover.core.records import record
@@ -75,62 +74,33 @@ def bbox_term(
 
 # --- Silhouettes that account for occlusion ----------------------------------------------------
 
+RENDERER = 12.0  # gradient of the authors' neural renderer over the exact one: 10 to 14, measured
+
 
 def silhouette_term(
     drawn: Float[Tensor, "*starts objects h w"],
     mask: Float[Tensor, "objects h w"],
     keep: Bool[Tensor, "objects h w"],
     form: Variant,
+    steeper: float = 1.0,
 ) -> Float[Tensor, "*starts objects"]:
     """Squared difference between drawn and detected masks [px], or per mask pixel (`robust`).
 
     `mask` is that in a square window around the object's box; `keep` is False where another
     object, or a person, may hide this one, and beyond the border of the image. The gradient is
-    exact (docs/method.md), hence 10-14 times smaller than that of the neural renderer that the
-    authors used; their weight is kept as printed.
+    exact, times `steeper` (`paper`).
     """
-    cost = squares(drawn, mask, keep)
+    gap = torch.where(keep, drawn - mask, 0.0).flatten(-2)
+    cost = (gap.unsqueeze(-2) @ gap.unsqueeze(-1))[..., 0, 0]
     if form == "robust":
         return cost / (mask * keep).sum((-2, -1)).clamp_min(1)
-    return cost
-
-
-def squares(
-    drawn: Float[Tensor, "*starts objects h w"],
-    mask: Float[Tensor, "objects h w"],
-    keep: Bool[Tensor, "objects h w"],
-) -> Float[Tensor, "*starts objects"]:
-    """Sum of the kept squared differences; differentiable once, in what is drawn."""
-    cost = _Squares.apply(drawn, mask, keep)
-    assert isinstance(cost, Tensor)
-    return cost
-
-
-class _Squares(torch.autograd.Function):
-    """Keeps the differences."""
-
-    @staticmethod
-    def forward(ctx: Any, drawn: Tensor, mask: Tensor, keep: Tensor) -> Tensor:  # noqa: ANN401
-        gap = torch.where(keep, drawn - mask, 0.0)
-        ctx.save_for_backward(gap)
-        flat = gap.flatten(-2)
-        return (flat.unsqueeze(-2) @ flat.unsqueeze(-1))[..., 0, 0]
-
-    @staticmethod
-    @once_differentiable
-    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
-        ctx: Any,  # noqa: ANN401
-        *grads: Tensor,
-    ) -> tuple[Tensor, None, None]:
-        (gap,) = ctx.saved_tensors
-        return gap * (2 * grads[0][..., None, None]), None, None
+    return cost if steeper == 1 else cost + (steeper - 1) * (cost - cost.detach())
 
 
 # --- Borders: outlines of masks are too wide or too narrow by about the same all round -----------
 #
-# A segmenter that draws every outline a pixel too wide moves a shelf whose base is hidden, and
-# makes the legs of a chair twice as thick: the position at which that costs least is not the true
-# one. What all borders of an object have in common says nothing about where it stands.
+# A segmenter that draws every outline a pixel too wide moves a shelf whose base is hidden. What all
+# borders of an object have in common says nothing about where it stands.
 
 BORDER_WEIGHT = 0.0005  # rho [1/px^2]
 

@@ -3,7 +3,6 @@
 import dataclasses
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import partial
 from typing import Generic, TypeVar
 
 import torch
@@ -39,8 +38,6 @@ class Term(Generic[S]):
     """The field of the weights."""
     cost: Callable[[S], PerItem]
     """What a state costs, before its weight."""
-    word: str
-    """What it is to people, after "held by" and "without"."""
     needs: tuple[str, ...] = ()
     """Names of the evidence without which it says nothing."""
     fused: bool = False
@@ -55,14 +52,10 @@ def active_weights(weights: W, terms: Iterable[Term[S]], has: Callable[[str], bo
     return dataclasses.replace(weights, **missing)
 
 
-def weigh(*terms: tuple[str, float, Callable[[], PerItem]]) -> Energy:
-    """Sum named terms; one with weight zero is neither computed nor needs its evidence."""
-    return Energy({name: weight * term() for name, weight, term in terms if weight != 0.0})
-
-
 def sum_terms(weights: object, terms: Iterable[Term[S]], state: S) -> Energy:
-    """The same for rows of an objective."""
-    return weigh(*((t.name, getattr(weights, t.name), partial(t.cost, state)) for t in terms))
+    """Sum terms; one with weight zero is neither computed nor needs its evidence."""
+    each = ((term, getattr(weights, term.name)) for term in terms)
+    return Energy({term.name: weight * term.cost(state) for term, weight in each if weight != 0.0})
 
 
 def there(evidence: S | None) -> S:

@@ -1,4 +1,4 @@
-"""Eq. 1 as a list of terms: what each costs, the evidence that it needs, and its word for people.
+"""Eq. 1 as a list of terms: what each costs, and the evidence that it needs.
 
 A new term is a function in `image_terms`, `human_terms` or `prior_terms`, a weight in
 `SceneWeights` and a row in `SCENE_TERMS`; its evidence is a field of `ImageCues` or `HumanCues`,
@@ -18,37 +18,11 @@ from mover.core.devices import constant
 from mover.core.observe import Energy, PerItem
 from mover.core.records import record, rows_of
 from mover.core.types import Camera, Layout, Objects
+from mover.energy import human_terms as people
+from mover.energy import image_terms as picture
+from mover.energy import prior_terms as prior
 from mover.energy.config import SceneConfig, SceneWeights
-from mover.energy.human_terms import (
-    BodySpace,
-    ContactPoints,
-    DepthRange,
-    collision_share,
-    collision_term,
-    contact_distance,
-    contact_term,
-    depth_term,
-    heading_term,
-    some_touches,
-)
-from mover.energy.image_terms import (
-    BestShift,
-    Borders,
-    Measured,
-    bbox_term,
-    fit_borders,
-    measured_term,
-    silhouette_term,
-)
 from mover.energy.minimize import Term, active_weights, sum_terms, there
-from mover.energy.prior_terms import (
-    Given,
-    Walls,
-    distance_term,
-    given_term,
-    scale_term,
-    wall_term,
-)
 from mover.geometry.camera import outermost, project, to_camera
 from mover.geometry.placement import place, place_in
 from mover.geometry.raster import Crops, Depths, Topology, look
@@ -77,13 +51,13 @@ class ImageCues:
     """Weight of the silhouette, below one where the shape is known to be wrong."""
     distance: Float[Tensor, " objects"] | None = None
     """From the camera to the middle of the base in the initial scene [m]; None: not known."""
-    borders: Borders | None = None
+    borders: picture.Borders | None = None
     """What the masks may be if their outlines are too wide or too narrow; None: they are not."""
-    walls: Walls | None = None
+    walls: prior.Walls | None = None
     """Lines along which furniture stands; None: none are known."""
-    given: Given | None = None
+    given: prior.Given | None = None
     """What is known of the objects before they are seen; None: nothing."""
-    measured: Measured | None = None
+    measured: picture.Measured | None = None
     """What a depth network sees; None: there is none."""
     beside: Float[Tensor, "objects 4 2"] | None = None
     """Shares of each side that something touches, and that something is near to; None: unknown."""
@@ -93,9 +67,9 @@ class ImageCues:
 class HumanCues:
     """What the people of all frames say about the room; None: that evidence is missing."""
 
-    depth: DepthRange | None = None
-    space: BodySpace | None = None
-    touches: ContactPoints | None = None
+    depth: people.DepthRange | None = None
+    space: people.BodySpace | None = None
+    touches: people.ContactPoints | None = None
 
 
 @dataclass(frozen=True)
@@ -175,10 +149,10 @@ class PlacedScene:
         return self.config.form == "robust" and bool(free)
 
     @cached_property
-    def fitted(self) -> BestShift:
+    def fitted(self) -> picture.BestShift:
         """Box and silhouette under the border of each mask that suits them best."""
         image, w = self.known.image, self.config.weights
-        return fit_borders(
+        return picture.fit_borders(
             self.silhouettes, self.extent, image.boxes, image.sides, image.keep, image.trust,
             there(image.borders), (w.bbox, w.silhouette),
         )  # fmt: skip
@@ -189,36 +163,42 @@ def _bbox(s: PlacedScene) -> PerItem:
     if s.loose:
         return s.fitted.bbox
     pixels = project(_corners(s), camera.K) if form == "paper" else s.extent
-    return bbox_term(pixels, image.boxes, image.sides, float(camera.width), form)
+    return picture.bbox_term(pixels, image.boxes, image.sides, float(camera.width), form)
 
 
 def _silhouette(s: PlacedScene) -> PerItem:
     image = s.known.image
     if s.loose:
         return s.fitted.silhouette
-    return image.trust * silhouette_term(s.silhouettes, image.masks, image.keep, s.config.form)
+    steeper = picture.RENDERER if s.config.readings.silhouette == "renderer" else 1.0
+    form, drawn = s.config.form, s.silhouettes
+    return image.trust * picture.silhouette_term(drawn, image.masks, image.keep, form, steeper)
 
 
 def _depth(s: PlacedScene) -> PerItem:
     bounds = there(s.known.humans.depth)
-    return depth_term(s.depths, s.known.image.masks, bounds, s.config.form)
+    contradiction = s.config.readings.contradiction
+    return people.depth_term(s.depths, s.known.image.masks, bounds, s.config.form, contradiction)
 
 
 def _collision(s: PlacedScene) -> PerItem:
-    points = place(s.known.objects.samples, s.layout)
-    space = there(s.known.humans.space)
-    touches = s.known.humans.touches if s.config.weights.contact else None
-    cost = collision_term(points, space)
+    objects, space, reads = s.known.objects, there(s.known.humans.space), s.config.readings
     if s.config.form == "paper":
-        return cost
-    return collision_share(s.known.objects, touches) * cost
+        every = reads.surface == "vertices"
+        points, real = (objects.verts, objects.real_verts) if every else (objects.samples, None)
+        return people.collision_term(place(points, s.layout), space, reads.lookup, real)
+    touches = s.known.humans.touches if s.config.weights.contact else None
+    share = people.collision_share(objects, touches)
+    return share * people.collision_term(place(objects.samples, s.layout), space)
 
 
 def _contact(s: PlacedScene) -> PerItem:
     objects, humans = s.known.objects, s.known.humans
     touches = there(humans.touches)
-    distance = contact_distance(s.layout, objects, touches)
-    return contact_term(distance, touches, len(objects.ids), s.config.form)
+    form, contact = s.config.form, s.config.readings.contact
+    components = form == "paper" and contact == "components"
+    distance = people.contact_distance(s.layout, objects, touches, components)
+    return people.contact_term(distance, touches, len(objects.ids), form, contact)
 
 
 def _corners(s: PlacedScene) -> Float[Tensor, "*starts objects 8 3"]:
@@ -229,35 +209,36 @@ def _corners(s: PlacedScene) -> Float[Tensor, "*starts objects 8 3"]:
 
 
 SCENE_TERMS: tuple[Term[PlacedScene], ...] = (
-    Term("bbox", _bbox, "its box", fused=True),
-    Term("silhouette", _silhouette, "its silhouette", fused=True),
+    Term("bbox", _bbox, fused=True),
+    Term("silhouette", _silhouette, fused=True),
     Term(
-        "scale", lambda s: scale_term(s.layout.log_scale, s.config.form, s.config.growth),
-        "its size", fused=True,
+        "scale", lambda s: prior.scale_term(s.layout.log_scale, s.config.form, s.config.growth),
+        fused=True,
     ),
-    Term("depth", _depth, "who hides whom", ("depth",), fused=True),
-    Term("collision", _collision, "free space", ("space",), fused=True),
-    Term("contact", _contact, "touch", ("touches",), fused=True),
+    Term("depth", _depth, ("depth",), fused=True),
+    Term("collision", _collision, ("space",), fused=True),
+    Term("contact", _contact, ("touches",), fused=True),
     Term(
-        "distance", lambda s: distance_term(s.layout, there(s.known.image.distance)),
-        "the distance it was given", ("distance",), fused=True,
-    ),
-    Term(
-        "heading", lambda s: heading_term(s.layout, there(s.known.humans.touches)),
-        "where its sitters face", ("touches",), fused=True,
+        "distance", lambda s: prior.distance_term(s.layout, there(s.known.image.distance)),
+        ("distance",), fused=True,
     ),
     Term(
-        "wall", lambda s: wall_term(s.layout, s.known.objects.size, there(s.known.image.walls)),
-        "the line of the furniture beside it", ("walls",), bare=True,
+        "heading", lambda s: people.heading_term(s.layout, there(s.known.humans.touches)),
+        ("touches",), fused=True,
     ),
     Term(
-        "given", lambda s: given_term(s.layout, there(s.known.image.given)),
-        "how it was given", ("given",), bare=True,
+        "wall",
+        lambda s: prior.wall_term(s.layout, s.known.objects.size, there(s.known.image.walls)),
+        ("walls",), bare=True,
     ),
     Term(
-        "measured", lambda s: measured_term(
+        "given", lambda s: prior.given_term(s.layout, there(s.known.image.given)),
+        ("given",), bare=True,
+    ),
+    Term(
+        "measured", lambda s: picture.measured_term(
             s.depths, s.known.image.masks, there(s.known.image.measured)),
-        "the measured depth", ("measured",),
+        ("measured",),
     ),
 )  # fmt: skip
 """All terms of Eq. 1; what is not in this list does not count, what is cannot be forgotten."""
@@ -305,10 +286,10 @@ def of_objects(evidence: E, index: Rows, count: int) -> E:
         index: Objects, each as often as it is asked for.
         count: Number of all objects.
     """
-    if isinstance(evidence, ContactPoints):
-        return cast(E, some_touches(evidence, index, count))
+    if isinstance(evidence, people.ContactPoints):
+        return cast(E, people.some_touches(evidence, index, count))
     if isinstance(evidence, HumanCues) and evidence.touches is not None:
-        touches = some_touches(evidence.touches, index, count)
+        touches = people.some_touches(evidence.touches, index, count)
         rest = rows_of(replace(evidence, touches=None), index, "objects", "items")
         return cast(E, replace(rest, touches=touches))
     return rows_of(evidence, index, "objects", "items")

@@ -7,9 +7,7 @@ r"""Terms of Eq. 1 that are known of objects before they are seen, and of object
     Walls     L_wall     = \sum_i \max_w q_{iw} - \max_w q_{iw} (1 - \rho(r_{iw}))
     Apart     L_apart    = \sum_i \sum_{j \ne i} 1000 mean_u w(u) h(s_j D_j(u_i) - m)
 
-The first is of the paper (supplement, "Loss Terms"); the others are not (`robust` only). The
-supplement calls the weight of L_scale lambda_3 in Eq. 1 but lambda_2 in L_scene; here both stages
-use 1000 (Eq. 1 and the released code agree).
+The first is of the paper (supplement, "Loss Terms"); the others are not (`robust` only).
 """
 
 import math
@@ -57,9 +55,8 @@ def scale_term(
 # --- Distance: objects stay at the distance of the initial scene ---------------------------------
 #
 # A tall object whose base is hidden and that no person touches is held in depth by its size alone:
-# then a border of a mask that is one pixel too wide moves it by a metre free of cost. The bound is
-# low (Geman and McClure), so that this term does not count where a base is seen or people constrain
-# more, however wrong the start is.
+# a mask that is one pixel too wide would move it by a metre. The bound is low (Geman and McClure),
+# so that this term does not count where a base is seen or people constrain more.
 
 DISTANCE_RHO = 0.1  # of the distance
 
@@ -74,20 +71,15 @@ def distance_term(
 
 # --- Given: near the initial scene, of usual sizes, along the room -------------------------------
 #
-# Place: 2 \log(1 + \delta^2 / 3 \sigma^2), \delta = \log \|t_i\| / \|t_i^{init}\|, a Student t: a
-#        guess of a distance is off by some per cent, seldom by more, never by metres.
-# Yaw:   the guess is off by some 20 degrees, one in ten is turned by a quarter or a half.
-# Axis:  most furniture stands along one of two directions of the room.
-# Size:  each of the three is about as large as given, or all are larger by as much as the object is
-#        farther (its picture was right): -\log of the mean of both chances, normal in the
-#        logarithms. And about as large as the standard dimensions of its class.
-# First: of objects without an initial position, axis and standard dimensions alone, these with the
-#        Student t of positions: the object may be of a kind that no standard knows.
-# d_i grows with what is left of the image's energy where the object fits best: a shape or a mask
-# that does not fit constrains by so much less where the object stands; which way it faces, the
-# worst outline still says better than a guess. Each cost is bounded or grows slowly, so that an
-# object that was given metres away or turned round is found where its shape fits or people
-# constrain it.
+# Distances have a Student t; yaws are off by some 20 degrees, one in ten by a quarter or a half
+# turn; most furniture stands along one of two directions of the room; sizes are about as given, or
+# all are larger by as much as the object is farther (its picture was right), and about those of its
+# class. Of objects without an initial position axis and standard dimensions alone count, these with
+# the Student t: the object may be of a kind that no standard knows. d_i grows with what is left of
+# the image's energy where the object fits best: the worse a shape fits, the less the image
+# constrains its position, though its outline still says better than a guess which way it faces.
+# Each cost is bounded or grows slowly, so that an object given metres away is found where its shape
+# fits.
 
 AWAY = 0.1  # standard deviation of the logarithm of a distance: some decimetres in a room
 TURN = math.radians(20)  # of a given yaw [rad]
@@ -265,13 +257,10 @@ def _across(
 # D_j is the horizontal way out of the closed mesh of object j, in its own frame [m]; u_i are even
 # surface samples of object i, s_j the mean horizontal scale of j; h(d) = d^2 up to d = r, 2 r d -
 # r^2 from there on, 0 below 0; w is 1 where object i goes on 1 cm above and below u, else 0.
-# The way out is horizontal because furniture stands on the floor: in a table top no point is deeper
-# than half its thickness, so that a chair's back could stay in it free of cost. A back that is far
-# from the edge of the top must not outweigh what is seen of both: from r on the cost rises evenly.
-# A seat that reaches the underside of a top from below is as deep as a back, but by an error of
-# heights
-# only: its upper side does not count. The term moves; it neither turns nor stretches, for two
-# objects should not shrink out of each other. Only in a last descent of all objects together.
+# The way out is horizontal, since in a table top no point is deeper than half its thickness; from r
+# on the cost rises evenly, so that a back far from the edge does not outweigh what is seen of both.
+# A seat that reaches the underside of a top does so by an error of heights only: its upper side
+# does not count. The term neither turns nor stretches: objects should not shrink out of each other.
 
 OVERLAP = 0.02  # [m]
 UPRIGHT = 0.01  # [m]

@@ -27,6 +27,10 @@ from mover.stages.objects.find_image_cues import people_in_reference
 from mover.stages.people.find_depth import DepthInputs, apply_depth, find_depth, size_spread
 from mover.stages.people.select_frames import SelectInputs, select_frames
 
+NO_POSA = (
+    "contacts.npz: missing, so contacts are estimated from geometry where the paper has POSA's"
+    " (mover contacts posa)"
+)
 LEAN = math.radians(2.0)  # of the floor under fitted bodies, whose poses err together [rad]
 LOWEST, HIGHEST = -30.0, -0.05  # [m] of a floor, below the camera
 APART = 1.0  # [m] between the given floor and that of the people, from which on there is a warning
@@ -98,6 +102,8 @@ def estimate_people(capture: Capture, config: Config, run: Run) -> Located | Non
     if found is None:
         return None
     odd = check_floor(found.alignment.ground, capture)
+    if config.foot_contacts.given and capture.touch is None:
+        odd += (NO_POSA,)
     return replace(found, warnings=(*found.warnings, *odd))
 
 

@@ -1,11 +1,15 @@
-"""The settings of all stages, and the two presets.
+"""The settings of all stages, and the presets.
 
-`paper`:  each formula and number as printed.
-`robust`: ours; docs/method.md gives the reason for each departure.
+`paper`:   the printed terms and numbers; what they leave open as "Readings of the paper" has it.
+`printed`: the literal form of each of these readings, one row of `READINGS` each.
+`robust`:  ours; docs/method.md gives the reason for each departure.
 """
 
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Literal, TypeVar
+from types import MappingProxyType
+from typing import Annotated, Any, Literal, TypeVar
 
 from mover.core.settings import float_in, int_in
 from mover.energy.config import Adam, BatchedBFGS, SceneWeights
@@ -95,6 +99,43 @@ PAPER = Config(
     place=PlaceConfig(),
 )
 
+Settings = Mapping[str, Any]
+"""Values by the dotted names of their settings."""
+READINGS: Mapping[str, Settings] = MappingProxyType({
+    "silhouette": {"layout.readings.silhouette": "renderer",
+                   "place.readings.silhouette": "renderer"},
+    "near bound": {"gather.near": "far side"},
+    "both bounds": {"gather.vote": False},
+    "borders": {"gather.erode": 0},
+    "contradictions": {"place.readings.contradiction": "count"},
+    "vertices": {"place.readings.surface": "vertices"},
+    "voxels": {"place.readings.lookup": "voxel"},
+    "contact sum": {"place.readings.contact": "sum"},
+    "contact components": {"place.readings.contact": "components"},
+    "assignment": {"assign.by": "vertex"},
+    "regions": {"prepare.regions": "normals"},
+    "feet": {"align.votes": "sum"},
+    "tilt": {"align.tilt_prior": math.inf},
+})  # fmt: skip
+"""The settings that switch each reading of `paper` to the literal form (docs/method.md)."""
+
+
+def changed(owner: Any, way: Sequence[str], value: Any) -> Any:  # noqa: ANN401
+    """Settings with one of them, or of those inside, replaced."""
+    key, *rest = way
+    return replace(owner, **{key: changed(getattr(owner, key), rest, value) if rest else value})
+
+
+def literally(config: Config, *readings: str) -> Config:
+    """The same with some readings in their literal form."""
+    for name in readings:
+        for setting, value in READINGS[name].items():
+            config = changed(config, setting.split("."), value)
+    return config
+
+
+PRINTED = literally(PAPER, *READINGS)
+
 _GROUPS = AssignConfig("group", cell=0.02, most=300)
 _SHORT = Adam(60, 0.03, 0.01, beta2=0.98, keep_best=True)
 _ROBUST_IMAGE = SceneWeights(
@@ -132,7 +173,7 @@ ROBUST = Config(
     silhouette_confidence=True,
 )  # fmt: skip
 
-PRESETS = {"paper": PAPER, "robust": ROBUST}
+PRESETS = {"paper": PAPER, "robust": ROBUST, "printed": PRINTED}
 _Weighted = TypeVar("_Weighted", PlaceConfig, RefineConfig)
 
 

@@ -19,6 +19,7 @@ from mover.energy.config import (
     Adam,
     BatchedBFGS,
     BodyWeights,
+    Readings,
     SceneWeights,
     Variant,
 )
@@ -90,8 +91,9 @@ class AlignConfig:
     """How far off the first pitch and roll usually are [rad]; inf: no prior."""
     offset_prior: Metres = 0.03
     """How far a person usually floats because of a wrong depth [m]; 0: not at all."""
-    votes: Literal["places", "points"] = "places"
-    """What counts once: a place where a person stood, or a point."""
+    votes: Literal["places", "points", "sum"] = "places"
+    """What counts once: a place where a person stood, a point, or (preset `printed`) all points
+    together, by their mean."""
     steps: Annotated[int, int_in(0, 10_000)] = 60
     """Most Gauss-Newton steps for each scale; 0: the camera stays as it is given."""
 
@@ -116,6 +118,9 @@ class PrepareConfig:
     """Even surface samples of each object."""
     region: Annotated[int, int_in(1, 100_000)] = 400
     """Points of each region that can be touched."""
+    regions: Literal["level", "normals"] = "level"
+    """What can be touched: the level layer of the seat and the back above it, or all of the
+    surface whose normal is upward or forward (preset `printed`)."""
     level_feet: bool = False
     """All feet of a proxy are put on the floor (`prepare_objects.levelled`)."""
     watertight: Literal["wrap", "occnet"] = "wrap"
@@ -165,6 +170,8 @@ class PlaceConfig:
     """Weight of the space that objects share, in a last descent of all together."""
     uniform_scale_weight: Weight = GROWTH
     """Cost of another size as a whole, against that of another shape (robust)."""
+    readings: Readings = field(default_factory=Readings)
+    """How the form `paper` reads what the formulas leave open."""
 
 
 @dataclass(frozen=True)
@@ -198,6 +205,10 @@ class GatherConfig:
 
     erode: Annotated[int, int_in(0, 100)] = 1
     """Pixels (of an image 640 wide) by which masks and silhouettes shrink."""
+    near: Literal["exit", "far side"] = "exit"
+    """The near bound: where the ray first leaves the body, or the far side of the body."""
+    vote: bool = True
+    """An object is hidden by a body or hides it in a frame, whichever region is larger, or both."""
     reach: Metres = 0.0
     """How far the outlines of bodies may be wrong: what is thinner is not hidden (robust) [m]."""
     cells: Annotated[int, int_in(8, 512)] = 256
@@ -208,8 +219,9 @@ class GatherConfig:
 class AssignConfig:
     """How contact vertices find their objects."""
 
-    by: Literal["mask_hits", "group"] = "mask_hits"
-    """By the rules of the authors' released code, or by groups of parts (`contact_association`)."""
+    by: Literal["mask_hits", "group", "vertex"] = "mask_hits"
+    """By the rules of the authors' released code, by groups of parts (`contact_association`), or
+    each vertex by itself (preset `printed`)."""
     cell: Annotated[float, float_in(1e-4, 10)] = 0.01
     """Contact points nearer than this become one with their count as weight [m]."""
     most: Count = 2000

@@ -8,7 +8,7 @@ import argparse
 import functools
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import field, make_dataclass, replace
+from dataclasses import field, make_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, cast
 
@@ -18,7 +18,7 @@ from tyro.conf import arg
 from mover.app.cli import say
 from mover.core.errors import InputError
 from mover.core.settings import check_settings, settings_of
-from mover.pipeline.presets import PRESETS, Config
+from mover.pipeline.presets import PRESETS, Config, changed
 
 T = TypeVar("T")
 C = TypeVar("C")
@@ -66,7 +66,18 @@ RUN_SETTINGS = {
     "image.size": "Longest side of an object's crop [px].",
     "gather.cells": "Cells along the longest side of the free space.",
     "gather.erode": "Pixels by which people's masks shrink.",
+    "gather.near": "Where the near bound of what a person hides lies.",
+    "gather.vote": "An object hides a body in a frame or is hidden, not both.",
+    "assign.by": "How touching skin is given to objects.",
+    "prepare.regions": "What of the furniture can be touched.",
+    "align.votes": "What counts once for the floor.",
     "contacts.given": "Use contacts.npz of the capture.",
+    "layout.readings.silhouette": "How steep silhouettes are before people are used (`paper`).",
+    "place.readings.silhouette": "How steep silhouettes are (`paper`).",
+    "place.readings.contradiction": "What pixels cost whose bounds cross (`paper`).",
+    "place.readings.surface": "What of an object may not be inside people (`paper`).",
+    "place.readings.lookup": "How the free space is looked up (`paper`).",
+    "place.readings.contact": "How the distances of touching skin add up (`paper`).",
 }
 """Settings of `Config` that `mover run` and `mover batch` have as flags, and what they are."""
 PERCEIVE_SETTINGS = {
@@ -180,12 +191,6 @@ def parsed_with(
     both.__doc__ = kind.__doc__
     args, found = tyro.cli(both, prog=prog, args=words, config=(tyro.conf.AvoidSubcommands,))
     for name in settings:
-        config = _changed(config, name.split("."), getattr(found, name.replace(".", "__")))
+        config = changed(config, name.split("."), getattr(found, name.replace(".", "__")))
     _checked(prog, args, config)
     return args, config
-
-
-def _changed(owner: Any, way: Sequence[str], value: Any) -> Any:  # noqa: ANN401
-    """Settings with one of them, or of those inside, replaced."""
-    key, *rest = way
-    return replace(owner, **{key: _changed(getattr(owner, key), rest, value) if rest else value})

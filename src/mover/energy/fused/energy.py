@@ -2,15 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from mover.core.observe import Energy
 from mover.core.types import Camera, Layout, Objects
-from mover.energy.config import SceneConfig, SceneWeights
+from mover.energy.config import SceneConfig
 from mover.energy.fused.launch import FUSED, FusedEnergy, fused_cost
 from mover.energy.fused.pack import kernel_of, real_parts
 from mover.energy.objective import (
@@ -23,16 +21,8 @@ from mover.energy.objective import (
     energy_of_terms,
 )
 
-
-@runtime_checkable
-class EnergyOf(Protocol):
-    """Eq. 1 of a layout, and of the camera's rotation if it is another."""
-
-    def __call__(
-        self, layout: Layout, R_cam_world: Float[Tensor, "3 3"] | None = None, /
-    ) -> Energy:
-        """The terms of each start of each object."""
-        ...
+EnergyOf = Callable[..., Energy]
+"""Eq. 1 of a layout, and of the camera's rotation (3, 3) if it is another."""
 
 
 def energy_function(
@@ -65,7 +55,9 @@ def energy_of_rows(
                 here = replace(few, camera=replace(camera, R_cam_world=R_cam_world))
             if kernel is None:
                 return energy_of_terms(rest, layout, here, config)
-            found = _by_kernel(kernel, config.weights, layout, rows, R_cam_world)
+            whole, parts = fused_cost(kernel, layout, rows, R_cam_world)
+            each = zip(FUSED, parts.unbind(-1), strict=True)
+            found = Energy({k: x for k, x in each if getattr(config.weights, k)}, whole)
             if not rest:
                 return found
             others = energy_of_terms(rest, layout, here, config)
@@ -74,19 +66,6 @@ def energy_of_rows(
         return energy
 
     return of
-
-
-def _by_kernel(
-    kernel: FusedEnergy,
-    weights: SceneWeights,
-    layout: Layout,
-    rows: Rows | None,
-    turn: Tensor | None,
-) -> Energy:
-    at = layout.t_world_object, layout.yaw, layout.log_scale
-    whole, parts = fused_cost(kernel, *at, rows, turn)
-    each = zip(FUSED, parts.unbind(-1), strict=True)
-    return Energy({name: part for name, part in each if getattr(weights, name)}, whole)
 
 
 def fused_energy(known: SceneEvidence, config: SceneConfig) -> FusedEnergy | None:
@@ -108,12 +87,9 @@ def _plain(known: SceneEvidence) -> bool:
     objects, camera, image, humans = known.objects, known.camera, known.image, known.humans
     tensors = [objects.verts, objects.samples, camera.K, camera.R_cam_world]
     tensors += [image.boxes, image.views.K, image.masks, image.trust]
-    if humans.depth is not None:
-        tensors += [humans.depth.near, humans.depth.far]
-    if humans.space is not None:
-        tensors += [humans.space.volume.values]
-    if humans.touches is not None:
-        tensors += [humans.touches.points, humans.touches.weight, humans.touches.heading]
+    some = ((humans.depth, "near far"), (humans.space and humans.space.volume, "values"),
+            (humans.touches, "points weight heading"))  # fmt: skip
+    tensors += [getattr(x, n) for x, names in some if x is not None for n in names.split()]
     here = all(x.dtype == torch.float32 and x.device.type == "cpu" for x in tensors)
     if not here or any(x.requires_grad for x in tensors) or not len(objects.ids):
         return False

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from mover.core.types import Layout
 from mover.energy.objective import SCENE_TERMS
 from mover.geometry.raster.draw import scratch_of
 from mover.geometry.warp_start import array, filled, kernels, share, started, threads
@@ -79,9 +80,7 @@ class _Buffers:
 
 def fused_cost(
     fused: FusedEnergy,
-    t_world_object: Float[Tensor, "*starts objects 3"],
-    yaw: Float[Tensor, "*starts objects"],
-    log_scale: Float[Tensor, "*starts objects 3"],
+    layout: Layout,
     rows: Int[Tensor, " objects"] | None = None,
     turn: Float[Tensor, "3 3"] | None = None,
 ) -> tuple[Float[Tensor, "*starts objects"], Float[Tensor, "*starts objects terms"]]:
@@ -89,15 +88,12 @@ def fused_cost(
 
     Args:
         fused: The kernel and its memory.
-        t_world_object: Places [m].
-        yaw: [rad].
-        log_scale: Logarithms of the scales.
-        rows: Which these are among the starts of all objects, counted through, each at most once;
-            None: all, in their order.
+        layout: Where the objects are.
+        rows: Which of (starts x objects) these are, each at most once; None: all, in their order.
         turn: From the world to the camera, a rotation, if it is another than the kernel's.
     """
-    layout = torch.cat([t_world_object, yaw.unsqueeze(-1), log_scale], -1)
-    whole, parts = _Cost.apply(layout, fused, rows, turn)
+    at = torch.cat([layout.t_world_object, layout.yaw.unsqueeze(-1), layout.log_scale], -1)
+    whole, parts = _Cost.apply(at, fused, rows, turn)
     return whole, parts
 
 
@@ -146,11 +142,7 @@ class _Cost(torch.autograd.Function):
 
 
 def _of_camera(slopes: Tensor, place: Tensor, turn: Tensor) -> Tensor:
-    """Change with the camera's rotation R of what the image says.
-
-    Under dR = R [w], points X of the world move by w x X before the camera, so that with forces F
-    dE = w . sum X x F = < R [sum X x F] / 2, dR >.
-    """
+    """Change with the camera's rotation R: under dR = R [w], dE = < R [sum X x F] / 2, dR >."""
     pull = slopes.sum(1)
     arm = torch.cross(place, pull[:, :3], dim=-1) + pull[:, [TURN_X, YAW, TURN_Z]]
     x, y, z = arm.sum(0).unbind()

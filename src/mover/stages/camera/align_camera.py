@@ -357,6 +357,8 @@ def _cause(found: Alignment, votes: Votes) -> str:
     """Why the feet leave the camera loose."""
     world = to_world(votes.foot_contacts.points_cam, found.camera.R_cam_world.double())[:, [0, 2]]
     spread = torch.linalg.svdvals(world - world.mean(0)) * (2 / len(world) ** 0.5)
+    if len(votes.weight) == 1:
+        return "all feet count as one point"
     if len(votes.foot_contacts.frame.unique()) == 1:
         return "feet were found in a single frame"
     if float(spread[0]) < NARROW:

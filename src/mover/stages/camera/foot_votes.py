@@ -32,8 +32,12 @@ class Votes:
     """One over the variance of the height [1/m²]."""
 
 
-def vote(foot_contacts: FootContacts, by: Literal["places", "points"]) -> Votes:
+def vote(foot_contacts: FootContacts, by: Literal["places", "points", "sum"]) -> Votes:
     """Give every sole point its weight: places share theirs among all frames spent there."""
+    if by == "sum":  # as printed: of all points together, here by their mean
+        points, first = foot_contacts.points_cam.mean(0, keepdim=True), slice(1)
+        who = {name: getattr(foot_contacts, name)[first] for name in ("person", "frame")}
+        foot_contacts = dataclasses.replace(foot_contacts, points_cam=points, **who)
     points = foot_contacts.points_cam.detach().cpu().double()
     frame, person = foot_contacts.frame.cpu(), foot_contacts.person.cpu()
     people, person_of = person.unique(return_inverse=True)

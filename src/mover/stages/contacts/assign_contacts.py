@@ -159,6 +159,8 @@ def _parts(rows: ContactRows, inputs: AssignInputs, config: AssignConfig) -> Int
     level = normals[:, 1].abs() >= LEVEL
     if config.by == "group":  # backs alone touch backs, unless they lie
         level = level | (inputs.parts.part_of[rows.vert] != PARTS.index("back"))
+    if config.by == "vertex":
+        level = level | ~inputs.objects.has_back[rows.object_of]
     return (~level).long() + 2 * rows.hand.long()
 
 

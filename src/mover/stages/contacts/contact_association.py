@@ -1,6 +1,7 @@
 """Which object each touching group of body parts touches (Sec. 3.1, "Contact constraint").
 
-`mask_hits` (paper) decides by the rules of the authors' released code (`decide_by_mask_hits`),
+`vertex` (printed) gives each vertex to the nearest object whose mask it projects into, `mask_hits`
+(paper) decides by the rules of the authors' released code (`decide_by_mask_hits`),
 `group` (robust) once for each body and group of parts, so that single wrong vertices have no
 weight, and lets only seats take a sitter and only other furniture a hand. A body's back touches
 what its seat touches. Hands that rest in the air and backs that lean on nothing are the commonest
@@ -82,6 +83,9 @@ class Candidates:
 
 def contact_rows(inputs: AssignInputs, config: AssignConfig) -> Iterator[ContactRows]:
     """All touching vertices with their objects, one group of one body at a time."""
+    if config.by == "vertex":
+        yield from _by_vertex(inputs)
+        return
     by_hits, bodies, camera = config.by == "mask_hits", inputs.bodies, small_camera(inputs.camera)
     groups = MASK_HIT_GROUPS if by_hits else GROUPS
     verts_of = [members(inputs.parts, *names) for names in groups]
@@ -113,6 +117,26 @@ def contact_rows(inputs: AssignInputs, config: AssignConfig) -> Iterator[Contact
             if touched >= 0:
                 body, object_of = (torch.full_like(verts, value) for value in (index, touched))
                 yield ContactRows(body, verts, object_of, torch.full_like(verts, hands).bool())
+
+
+def _by_vertex(inputs: AssignInputs) -> Iterator[ContactRows]:
+    """Each touching vertex of the body with the nearest object whose mask it projects into."""
+    bodies, camera, objects = inputs.bodies, small_camera(inputs.camera), inputs.objects
+    hand, body = (members(inputs.parts, *names) for names in MASK_HIT_GROUPS[::-1])
+    touching, masks = (inputs.probability > CHANCE) & (hand | body), _candidates(inputs).masks
+    parts = [place(part, inputs.layout) for part in (objects.top, objects.back)]
+    for index in touching.any(1).nonzero()[:, 0].tolist():
+        verts = touching[index].nonzero()[:, 0]
+        points = bodies.verts[index, verts]
+        pixels = project(to_camera(points, camera.R_cam_world), camera.K).long()
+        covered, shown = at_pixels(masks, pixels)
+        top, back = (torch.cdist(points, part).amin(-1) for part in parts)
+        away = torch.minimum(top, back.masked_fill(~objects.has_back[:, None], torch.inf))
+        may = covered & shown & objects.has_top[:, None] & (away < FARTHEST)
+        nearest = torch.where(may, away, torch.inf).argmin(0)
+        touched = may.any(0)
+        verts, object_of = verts[touched], nearest[touched]
+        yield ContactRows(torch.full_like(verts, index), verts, object_of, hand[verts])
 
 
 def _candidates(inputs: AssignInputs) -> Candidates:

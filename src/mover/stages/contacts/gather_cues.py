@@ -31,7 +31,7 @@ from mover.energy.objective import HumanCues
 from mover.geometry.camera import to_camera
 from mover.geometry.crops import sample_nearest
 from mover.geometry.path import is_still, poses_at, resampled
-from mover.geometry.raster import Crops, layers
+from mover.geometry.raster import Crops, Topology, depths, layers
 from mover.geometry.thinning import coarser
 from mover.geometry.volume import grid_around
 from mover.geometry.volume_warp import union_bodies
@@ -158,6 +158,12 @@ def _bounds(
     verts = to_camera(inputs.bodies.verts[torch.tensor(block)], camera.R_cam_world)
     many = replace(views, K=views.K.expand(len(block), 3, 3))
     drawn = to_device(layers(verts, inputs.bodies.faces, many), "cpu")  # where the masks are
+    leave = drawn.exit
+    if config.near == "far side":
+        faces = inputs.bodies.faces.expand(len(block), -1, -1)
+        shape = Topology(faces, faces.new_zeros(len(block), 0, 4))
+        seen = depths(verts, shape, many)
+        leave = torch.where(seen.covered, seen.farthest, leave.to(seen.farthest)).cpu()
     for k, row in enumerate(block):
         front, body = drawn.front[k], drawn.front[k] < float("inf")
         first, last = _ends(body.any(1))
@@ -171,10 +177,10 @@ def _bounds(
         reach = config.reach
         if reach > 0:
             reach *= float(views.K[0, 0, 0] / verts[k, :, 2].median().clamp_min(NEAREST))
-        seen = BodyView(front[window], drawn.exit[k][window], visible, others, reach)
+        view = BodyView(front[window], leave[k][window], visible, others, reach)
         objects = small_masks(inputs.masks, camera, window).cpu()
         objects = objects[objects.flatten(1).any(1)]
-        yield window, bounds_of(seen, objects, config.erode)
+        yield window, bounds_of(view, objects, config.erode, config.vote)
 
 
 def _masks_in(

@@ -68,7 +68,8 @@ def energy_of(inputs: PlaceInputs, config: PlaceConfig) -> Callable[[Layout], En
 
 
 def _rows(inputs: PlaceInputs, config: PlaceConfig) -> Callable[[Rows | None], EnergyOf]:
-    weights = SceneConfig(config.weights, config.form, config.uniform_scale_weight)
+    growth = config.uniform_scale_weight
+    weights = SceneConfig(config.weights, config.form, growth, config.readings)
     return energy_of_rows(inputs.objects, inputs.camera, inputs.image, inputs.humans, weights)
 
 

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -35,13 +36,20 @@ LAYER = 0.05  # [m], thickness of the layer that is one seat
 
 
 def find_regions(
-    points: Float[Tensor, "points 3"], normals: Float[Tensor, "points 3"], category: str
+    points: Float[Tensor, "points 3"],
+    normals: Float[Tensor, "points 3"],
+    category: str,
+    rule: Literal["level", "normals"] = "level",
 ) -> tuple[Float[Tensor, "tops 3"], Float[Tensor, "backs 3"]]:
     """Surface points of the seat or top, and of the back, in the object's frame [m].
 
     The seat is the largest level layer above a quarter of the height, so that neither arms nor the
-    back's rim count; a top is the highest layer with a quarter of the largest one's area.
+    back's rim count; a top is the highest layer with a quarter of the largest one's area. By
+    `normals` all that looks upward is the seat or top, and all that looks forward the back.
     """
+    if rule == "normals":
+        up, forward = normals[:, 1] > UPRIGHT, normals[:, 2] > UPRIGHT
+        return points[up], points[forward if category in BACKS else torch.zeros_like(up)]
     y = points[:, 1]
     height = float(y.max())
     facing = (normals[:, 1] > UPRIGHT) & (y > 0.25 * height)
@@ -201,7 +209,7 @@ def _proxy(piece: SceneObject, config: PrepareConfig, close: Callable[[Mesh], Me
         mesh = levelled(mesh)
     points = sample_surface(mesh, 4 * config.samples)
     samples, _ = sample_surface(mesh, config.samples)
-    regions = find_regions(*points, canonical(piece.category))
+    regions = find_regions(*points, canonical(piece.category), config.regions)
     return _Proxy(mesh, edges_of(mesh.faces), samples, *regions, center)
 
 
