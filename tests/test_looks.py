@@ -81,11 +81,13 @@ def test_what_is_lost_of_the_looks_is_said(
 
 def test_pictures_of_a_gltf_are_found_in_any_case(tmp_path: Path) -> None:
     import trimesh
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
 
     part = trimesh.creation.box()
     uv = np.zeros((len(part.vertices), 2))
-    look = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.new("RGB", (2, 2), RED))
-    part.visual = trimesh.visual.TextureVisuals(uv=uv, material=look)
+    look = PBRMaterial(baseColorTexture=Image.new("RGB", (2, 2), RED))
+    part.visual = TextureVisuals(uv=uv, material=look)
     files: Any = trimesh.Scene(part).export(file_type="gltf")
     for name, content in files.items():
         (tmp_path / name).write_bytes(content)

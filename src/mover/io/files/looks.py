@@ -177,18 +177,17 @@ def _amounts(tree: Any) -> Iterator[tuple[int, int, str]]:  # noqa: ANN401
 
 def source_of(path: Path, *, looks: bool) -> Source:
     """What trimesh is given of a file: clean text, and the files that it names."""
-    match path.suffix.lower():
-        case ".obj":
-            return _obj(path, looks=looks)
-        case ".gltf":
-            return _gltf(path)
-        case ".off" | ".stl" | ".ply":
-            content = path.read_bytes()
-            text = content if b"\0" not in content else b""
-            try:
-                text.decode()
-            except UnicodeDecodeError:  # of a comment or a name
-                return Source(text.decode("cp1252", errors="replace").encode(), {}, ())
+    kind = path.suffix.lower()
+    if kind == ".obj":
+        return _obj(path, looks=looks)
+    if kind == ".gltf":
+        return _gltf(path)
+    content = path.read_bytes() if kind in (".off", ".stl", ".ply") else b"\0"
+    if b"\0" not in content:
+        try:
+            content.decode()
+        except UnicodeDecodeError:  # of a comment or a name
+            return Source(content.decode("cp1252", errors="replace").encode(), {}, ())
     return Source(None, {}, ())
 
 

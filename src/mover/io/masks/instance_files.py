@@ -67,6 +67,7 @@ GAPS = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)
 """Ids that COCO leaves out."""
 COCO_IDS = tuple(n for n in range(1, 91) if n not in GAPS)
 """COCO's own ids of its classes."""
+MOST_THINGS = 5000  # in one picture
 LEAST_SCORE = 0.3  # of MMDetection, which writes everything that it thought of
 EXPORTS = {
     "Label Studio's JSON": "COCO (polygons) or 'Brush labels to PNG'",
@@ -279,12 +280,9 @@ def coco_instances(
         notes = (f"{at.file}: of {len(listed)} images only {ours.file_name or ours.id} is taken",)
         listed = [(item, image) for item, image in listed if image.id == ours.id]
         rows = [(item, row) for item, row in rows if row.image_id == ours.id]
-    sizes: dict[int, Size] = {}
-    for item, image in listed:
-        own = (image.width, image.height) if image.width and image.height else size
-        if own is None:
-            refuse(item, "width and height, here or by --image")
-        sizes[image.id] = own
+    if picture is not None and len(rows) > MOST_THINGS:
+        refuse(get(at, "annotations"), f"at most {MOST_THINGS} in a picture", f"{len(rows)} items")
+    sizes = _sizes_of(listed, size)
     tracked = any(row.track_id is not None for _, row in rows)
     frames, more = _frames_of_images([image for _, image in listed], at.file, tracked=tracked)
     found = [_instance(item, row, sizes[row.image_id or 0], words, frames) for item, row in rows]
@@ -292,6 +290,17 @@ def coco_instances(
         refuse(get(at, "images"), "images of one size", f"{len(set(sizes.values()))} sizes")
     looked, own = frozenset(frames.values()), next(iter(sizes.values()), size)
     return Instances(tuple(found), own, at.file, looked, (*notes, *more))
+
+
+def _sizes_of(images: Sequence[tuple[At, ImageFields]], size: Size | None) -> dict[int, Size]:
+    """Width and height of each image by its id; of those without, the known ones."""
+    sizes: dict[int, Size] = {}
+    for item, image in images:
+        own = (image.width, image.height) if image.width and image.height else size
+        if own is None:
+            refuse(item, "width and height, here or by --image")
+        sizes[image.id] = own
+    return sizes
 
 
 def _ours(

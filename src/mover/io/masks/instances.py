@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mover.core.errors import InputError
 from mover.core.types import Masks
 from mover.furniture.library import plain_name, unknown_names
-from mover.geometry.rle import area, decode, encode, tight_box
+from mover.geometry.rle import area, decode, encode
 from mover.io.capture.parts import UNKNOWN
 from mover.io.files.fields import LAST_INDEX, At, listed, read_json, refuse
 from mover.io.masks.coco import annotations_tree, from_coco, segmentation
@@ -166,7 +166,7 @@ def objects_tree(found: Instances, items: Sequence[Instance]) -> At:
         if item.mask is not None:
             mask = Masks(height, width, (item.mask,))
             row["segmentation"] = segmentation(mask, 0)
-            box = tuple(float(v) for v in tight_box(decode(mask, 0)))
+            box = tuple(_box_of(item, found.size))
         if box is None or box[2] <= box[0] or box[3] <= box[1]:
             continue  # empty: there is nothing of it in the image
         x, y, right, bottom = box
@@ -219,7 +219,8 @@ def followed(found: Instances) -> Instances:
     notes = found.notes
     if free:
         boxes = np.array([_box_of(item, found.size) for item in free]).reshape(-1, 4)
-        order = np.lexsort((boxes[:, 0] + boxes[:, 2], [item.frame for item in free]))
+        left = (boxes[:, 0] + boxes[:, 2]).tolist()
+        order = sorted(range(len(free)), key=lambda k: (free[k].frame, left[k]))
         boxes, free = boxes[order] / 2, [free[k] for k in order]
         sizes = np.linalg.norm(boxes[:, 2:] - boxes[:, :2], axis=1)
         frames = [item.frame for item in free]
