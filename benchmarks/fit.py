@@ -1,10 +1,11 @@
 """Bodies fitted to 2D joints alone: python benchmarks/fit.py --rooms 0 1 2.
 
-Known rooms give the joints of `benchmarks/video.py`: COCO's 17 with 3 to 6 px of noise, missed and
-swapped ones, guesses of occluded ones, and a camera whose tilt is 3 degrees off. PJE is the mean
-distance of the 22 joints of the body from the truth, absolute and after Procrustes alignment, by
-posture. Without `--rooms` 24 development rooms are taken, in twelve of which a person lies and in
-twelve of which a person is half occluded. `--height` gives the fit the heights of the people.
+Known rooms give the joints of `benchmarks/video.py`: COCO's 17 of another body, with errors that
+last, missed and swapped ones, guesses of occluded ones, and a camera whose tilt is 3 degrees off.
+PJE is the mean distance of the 22 joints of the body from the truth, absolute and after Procrustes
+alignment, by posture. Without `--rooms` 24 development rooms are taken, in twelve of which a person
+lies and in twelve of which a person is half occluded. `--height` gives the fit the heights of the
+people.
 """
 
 import argparse
@@ -99,13 +100,13 @@ def by_posture(seed: int, fps: float, tall: bool) -> tuple[dict[str, Tensor], Te
     assert found.bodies.joints is not None
     assert room.bodies.joints is not None
     pairs = misses(found.bodies.joints, room.bodies.joints[rows])
-    found = {name: 1e3 * pairs[which] for name, which in postures(room, rows).items() if which}
+    each = {name: 1e3 * pairs[which] for name, which in postures(room, rows).items() if which}
     means = ", ".join(
-        f"{n} {len(v)}: {v[:, 0].mean():.0f} / {v[:, 1].mean():.0f}" for n, v in found.items()
+        f"{n} {len(v)}: {v[:, 0].mean():.0f} / {v[:, 1].mean():.0f}" for n, v in each.items()
     )
     off = too_tall(found, heights)
     print(f"room {seed}: {means}, height {off.mean():+.1f} %", flush=True)
-    return found, off
+    return each, off
 
 
 def table(seeds: list[int], fps: float, tall: bool) -> None:
