@@ -586,9 +586,9 @@ def test_unlikely_people_are_named_with_a_cure(case, tmp_path):
     (warning,) = odd_bodies(found)
     assert re.search(words, warning)
     write_bodies(found, tmp_path / "bodies.npz")
-    told: list[str] = []
-    read_bodies(tmp_path / "bodies.npz", told.append)
-    assert told == [f"bodies.npz: {warning}"]
+    words: list[str] = []
+    read_bodies(tmp_path / "bodies.npz", words.append)
+    assert words == [f"bodies.npz: {warning}"]
 
 
 def test_pieces_of_whams_walker_are_one_person_and_the_user_can_join_more(tmp_path):

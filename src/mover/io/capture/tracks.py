@@ -32,7 +32,7 @@ Track = tuple[str, int]
 
 
 @dataclass(frozen=True)
-class Pairs:
+class TrackPairs:
     """One number for each person: the new number by the old one, and what changed in words."""
 
     bodies: Mapping[int, int]
@@ -40,7 +40,7 @@ class Pairs:
     notes: tuple[str, ...] = ()
 
 
-def pair_tracks(bodies: Bodies, people: People, camera: Camera) -> Pairs:
+def pair_tracks(bodies: Bodies, people: People, camera: Camera) -> TrackPairs:
     """Pair tracks of bodies and of masks by their positions in the image.
 
     A body and a mask are paired where their boxes overlap in the frames that they share, and no
@@ -76,7 +76,7 @@ def pair_tracks(bodies: Bodies, people: People, camera: Camera) -> Pairs:
     return _numbered(groups, bodies, people)
 
 
-def _numbered(groups: Mapping[Track, set[Track]], bodies: Bodies, people: People) -> Pairs:
+def _numbered(groups: Mapping[Track, set[Track]], bodies: Bodies, people: People) -> TrackPairs:
     """Numbers of the groups in which no person is twice in a frame."""
     sides: Mapping[str, Bodies | People] = {"bodies": bodies, "masks": people}
     found: dict[str, dict[int, int]] = {"bodies": {}, "masks": {}}
@@ -97,10 +97,10 @@ def _numbered(groups: Mapping[Track, set[Track]], bodies: Bodies, people: People
         if found[name]:
             same = ", ".join(f"track {old} is {new}" for old, new in found[name].items())
             notes.append(f"{file}: by its position in the image {same}")
-    return Pairs(found["bodies"], found["masks"], tuple(notes))
+    return TrackPairs(found["bodies"], found["masks"], tuple(notes))
 
 
-def paired(bodies: Bodies, people: People, pairs: Pairs) -> tuple[Bodies, People]:
+def paired(bodies: Bodies, people: People, pairs: TrackPairs) -> tuple[Bodies, People]:
     """Bodies and masks under the numbers of `pair_tracks`."""
     heights = {str(pairs.masks.get(int(k), int(k))): v for k, v in people.heights.items()}
     return replace(bodies, person=renumbered(bodies.person, pairs.bodies)), replace(
