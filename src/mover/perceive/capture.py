@@ -170,9 +170,9 @@ def moving_people(
         joints, faster = found[1], min(2 * (clip.fps or 0.0), most)
         if joints is None or video.own.keypoints is not None or faster <= (clip.fps or 0.0):
             return clip, drift, *found
-        if len(clip.time) >= FEWEST and not restless(joints):
+        if not restless(joints):
             return clip, drift, *found
-        say(f"people move fast, or the clip is short: {faster:g} frames a second are taken")
+        say(f"people move fast: {faster:g} frames a second are taken")
         config = replace(config, frames=replace(config.frames, fps=faster))
 
 
