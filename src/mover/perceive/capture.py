@@ -65,10 +65,7 @@ from mover.stages.config import LensConfig
 
 log = logging.getLogger(__name__)
 BEND, OFTEN = 0.15, 0.9  # of the height: second difference of the trunk, and of how many frames
-FEWEST, DENSEST = (
-    30,
-    20.0,
-)  # frames that a clip should have, and frames a second from which none more
+DENSEST = 20.0  # frames a second
 SIDES = ("left", "right")
 CHUNK = 50  # frames whose detections are kept together
 # How far off a focal length may be, of its logarithm; what a file gives stays as it is.
