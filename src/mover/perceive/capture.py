@@ -76,6 +76,7 @@ SAME_FORMAT = 0.01  # difference of two ratios of width and height
 GUESS = "perceived/guess.json"  # the camera before a first scene, and as it left it
 SAME_TILT = 1e-6  # elements of a rotation that was read back
 TILT = math.radians(8)  # of a camera on a shelf, before anything is seen of it
+CLEARLY = 2.0  # standard deviations by which lines contradict a lens before any body is seen
 USUAL = 60.0  # [degrees], horizontal field of view of phones held level, where nothing is known
 EXIF_IFD, FOCAL_35 = 0x8769, 0xA405
 Say = Callable[[str], None]
@@ -268,7 +269,7 @@ def lens_by_lines(
         return camera, spread
     segments = find_segments(clean.picture, clean.hidden, camera.K[:2, 2])
     found = find_lens(LensInputs(segments, camera, spread, TILT), LensConfig())
-    if found.zoom == 1:
+    if abs(math.log(found.zoom)) < CLEARLY * found.spread:  # the feet will say more
         return camera, spread
     say(
         f"lens: the lines of the picture show a focal length {100 * (found.zoom - 1):+.1f} ± "
