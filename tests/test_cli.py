@@ -2,6 +2,7 @@ import errno
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -62,6 +63,46 @@ def test_ctrl_c_ends_a_run_at_once_and_the_same_command_goes_on(folder, tmp_path
     kept = {path: path.stat().st_mtime_ns for path in stages.rglob("*.json")}
     assert subprocess.run(command, capture_output=True).returncode == 0
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
+
+
+def command_that(body: str) -> list[str]:
+    """`mover run` with another body, in a process of its own."""
+    code = "import sys, time; from mover.app import cli\n"
+    code += f"def body(_):\n    {body}\n"
+    code += "cli.command_of = lambda _: body; sys.argv = ['mover', 'run']; cli.main()"
+    return [sys.executable, "-c", code]
+
+
+def test_ctrl_c_ends_a_run_whose_library_swallows_it():
+    body = "\n    ".join([
+        "print('ready', flush=True)", "for _ in range(2):", "    try:", "        time.sleep(30)",
+        "    except BaseException:", "        pass",
+    ])  # fmt: skip
+    both = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command_that(body), **both) as run:
+        assert run.stdout.readline() == "ready\n"
+        run.send_signal(signal.SIGINT)
+        said = run.communicate(timeout=20)[1]
+    assert run.returncode == 130
+    assert said == "\nmover run: stopped; the same command goes on from here\n"
+
+
+@pytest.mark.parametrize(
+    ("body", "said", "code"),
+    [
+        ("raise MemoryError", "mover run: out of memory; what was finished is kept\n", 2),
+        (
+            "raise RuntimeError('[enforce fail at alloc_cpu.cpp:127]')",
+            "mover run: out of memory; what was finished is kept\n", 2,
+        ),
+        ("cli.say('out'), cli.say('ü', sys.stderr)", "\\xfc\n", 0),
+    ],
+)  # fmt: skip
+def test_no_memory_a_closed_output_and_old_letters_are_no_traceback(body, said, code):
+    words = " ".join(map(shlex.quote, command_that(body))) + " >&-"
+    env = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    found = subprocess.run(["bash", "-c", words], capture_output=True, text=True, env=env)
+    assert (found.stderr, found.returncode) == (said, code)
 
 
 @pytest.mark.parametrize("before", [True, False])

@@ -17,9 +17,9 @@ from mover.core.types import Capture
 from mover.geometry.boxes import box_of, iou3d
 from mover.geometry.camera import pitch_roll
 from mover.geometry.placement import place_object
+from mover.io.capture.faults import check_against_picture
 from mover.io.capture.folder import read_capture
 from mover.io.capture.merge import Imported, import_into
-from mover.io.capture.pairing import odd_world, overlap
 from mover.io.capture.parts import Hints
 from mover.io.files.fields import At
 from mover.io.formats import IMPORTED, chosen
@@ -115,8 +115,9 @@ def test_a_known_room_comes_back(plain: layouts.Room, tmp_path: Path, case: str)
         assert detection.box.tolist() == pytest.approx(plain.box2d(thing), abs=1e-3)
     if tool == "total3d":
         assert found.scene.ground == pytest.approx(plain.ground, abs=1e-5)
-        assert overlap(found.scene, found.detections) == pytest.approx(1, abs=1e-3)
-        assert odd_world(found.scene, found.detections) is None
+        findings = check_against_picture(found)
+        assert findings.agreement.objects.mean() == pytest.approx(1, abs=1e-3)
+        assert findings.warnings == ()
 
 
 def test_total3d_numbers_are_numbers_not_words(plain: layouts.Room, tmp_path: Path) -> None:
@@ -219,9 +220,9 @@ def test_a_scene_in_another_world_is_named(
     seen = tuple(
         dataclasses.replace(detections[0], id=i, box=boxes[p.id]) for i, p in enumerate(pieces)
     )
-    said = odd_world(dataclasses.replace(found.scene, objects=pieces), seen)
-    assert said is not None
-    assert word in said
+    scene = dataclasses.replace(found.scene, objects=pieces)
+    said = check_against_picture(dataclasses.replace(found, scene=scene, detections=seen)).warnings
+    assert word in said[0]
 
 
 def test_a_tilted_object_stands_upright_about_its_centre(

@@ -36,6 +36,12 @@ def test_the_best_few_really_differ():
     torch.testing.assert_close(found.yaw[:, 0], torch.tensor([0.1, 2.0]))
 
 
+def test_an_object_without_evidence_keeps_the_start_that_was_given():
+    turned = starts.spread(layout_of([0.1, -0.8]), 24)
+    found = starts.best_few(turned, torch.zeros(48, 1), 6)
+    assert float(found.yaw[0, 0]) == float(turned.yaw[0, 0])
+
+
 def test_places_far_apart_are_different_starts():
     found = starts.best_few(layout_of([0.0, 0.0], [0.0, 0.5]), torch.tensor([[1.0], [0.5]]), 2)
     torch.testing.assert_close(found.t_world_object[:, 0, 0], torch.tensor([0.5, 0.0]))

@@ -109,7 +109,7 @@ def report_of(
 ) -> ReportContent:
     """What the report shows."""
     return ReportContent(
-        title=capture.name,
+        title=capture.name.encode("utf-8", "surrogateescape").decode("utf-8", "replace"),
         image=capture.reference,
         initial=room.initial,
         result=room.scene,
@@ -131,8 +131,9 @@ def report_of(
 
 
 def command_line() -> str:
-    """What was typed."""
-    return " ".join(["mover", *sys.argv[1:]])
+    """What was typed, in letters of UTF-8 whatever the locale is."""
+    typed = " ".join(["mover", *sys.argv[1:]])
+    return typed.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
 
 
 def _write_log(room: Room, config: Config, run: Run, origin: Origin) -> None:

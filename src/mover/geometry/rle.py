@@ -67,6 +67,16 @@ def area(masks: Masks, index: int) -> int:
     return int(run_lengths(masks.counts[index])[1::2].sum())
 
 
+def mask_boxes(masks: Masks) -> Float[Tensor, "masks 4"]:
+    """x_min, y_min, x_max, y_max of each of the masks [px]; zeros where one is empty."""
+    from pycocotools import mask as coco
+
+    size = [masks.height, masks.width]
+    codes: Any = [{"size": size, "counts": code} for code in masks.counts]
+    found = torch.from_numpy(np.asarray(coco.toBbox(codes), np.float32).reshape(-1, 4))
+    return torch.cat([found[:, :2], found[:, :2] + found[:, 2:]], 1)
+
+
 def joined(masks: Sequence[Masks]) -> Masks:
     """Masks of one image size, one after the other."""
     counts = tuple(code for m in masks for code in m.counts)

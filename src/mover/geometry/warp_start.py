@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from pathlib import Path
+from tempfile import mkdtemp
 from threading import RLock
 from types import ModuleType
 from typing import Any, TypeVar
@@ -33,8 +34,19 @@ def _started() -> ModuleType:
     import warp as wp
 
     with _quiet(wp):
-        wp.init()
+        try:
+            wp.init()
+        except OSError:
+            _keep_kernels_elsewhere(wp)
+            wp.init()
     return wp
+
+
+def _keep_kernels_elsewhere(wp: ModuleType) -> None:
+    """Kernels of this run go into a temporary folder: the cache folder cannot be written."""
+    before, folder = wp.config.kernel_cache_dir or "the cache folder", mkdtemp(prefix="mover-")
+    log.warning("%s cannot be written: kernels are compiled in each run, in %s", before, folder)
+    wp.config.kernel_cache_dir = folder
 
 
 def kernels(name: str, device: str, package: str = KERNELS) -> ModuleType:
@@ -54,6 +66,8 @@ def _loaded(package: str, name: str, device: str) -> ModuleType:
     threads = 1 if device == "cpu" else None  # of a block; it is a part of the name
     folder = wp.get_module(module.__name__).get_module_identifier(threads)
     if not (Path(wp.config.kernel_cache_dir) / folder).is_dir():
+        if not os.access(wp.config.kernel_cache_dir, os.W_OK):
+            _keep_kernels_elsewhere(wp)
         log.info("compiling kernels, once on this machine: %s for %s ...", name, device)
     with _quiet(wp):
         wp.load_module(module, device=device)

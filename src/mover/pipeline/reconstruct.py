@@ -5,6 +5,7 @@ from dataclasses import replace
 from mover.core.run import Run as Run
 from mover.core.settings import check_settings
 from mover.core.types import Capture, Room
+from mover.io.capture.faults import check_against_picture
 from mover.io.capture.plausible import check_plausible
 from mover.pipeline import objects as steps
 from mover.pipeline.people import Located, check_floor, estimate_people, through_its_lens
@@ -23,6 +24,7 @@ def reconstruct(capture: Capture, config: Config, run: Run, pinned: tuple[str, .
     check_settings(config, "config")
     odd: list[str] = []
     check_plausible(capture, odd.append)
+    odd += check_against_picture(capture).warnings
     capture = replace(capture, warnings=tuple(dict.fromkeys((*capture.warnings, *odd))))
     given, capture = capture.scene, through_its_lens(capture, config, run, pinned)  # robust
     people = estimate_people(capture, config, run)  # frames, depth, feet: camera and ground

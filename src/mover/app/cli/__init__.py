@@ -3,8 +3,12 @@
 import importlib
 import logging
 import os
+import re
+import signal
 import sys
+import threading
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 from mover.core.errors import InputError
@@ -84,6 +88,12 @@ COMMANDS = {
     ),
 }
 """Where a command is, and what it does."""
+OWN_INTERRUPT = ("batch", "experiment", "paper-table")
+"""Commands that end their own processes on Ctrl-C."""
+PATIENCE = 0.8  # [s] after Ctrl-C
+INTERRUPTED = 130
+STOPPED = "\nmover {}: stopped; the same command goes on from here"
+OUT_OF_MEMORY = r"(?i)out of memory|alloc_cpu|DefaultCPUAllocator|can't allocate"
 USAGE = "usage: mover COMMAND [OPTIONS]; mover COMMAND --help says more"
 
 
@@ -102,12 +112,17 @@ def main() -> None:
     if arguments[0] not in COMMANDS:
         say(f"mover: no command {arguments[0]!r}; there are {', '.join(COMMANDS)}\n{USAGE}")
         raise SystemExit(2)
+    if arguments[0] not in OWN_INTERRUPT:
+        signal.signal(signal.SIGINT, partial(_interrupt, arguments[0]))
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     said: set[str] = set()
     for handler in logging.getLogger().handlers:  # each message once
         handler.addFilter(lambda r: not ((m := r.getMessage()) in said or said.add(m)))
     logging.getLogger("mover.geometry.kernels").setLevel(logging.INFO)  # what is compiled, once
-    raise SystemExit(run_command(arguments[0], arguments[1:]))
+    code = run_command(arguments[0], arguments[1:])
+    if code == INTERRUPTED:
+        os._exit(code)  # stages that are computed beside others would be waited for
+    raise SystemExit(code)
 
 
 def run_command(name: str, arguments: Sequence[str]) -> int:
@@ -126,10 +141,33 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
             f"mover {name}: {where}{error.strerror or error}; what was finished is kept", sys.stderr
         )
         return 2
+    except (MemoryError, RuntimeError) as error:  # torch raises the second
+        if isinstance(error, RuntimeError) and not re.search(OUT_OF_MEMORY, str(error)):
+            raise
+        say(f"mover {name}: out of memory; what was finished is kept", sys.stderr)
+        return 2
     except KeyboardInterrupt:
-        say(f"\nmover {name}: stopped; the same command goes on from here", sys.stderr)
-        return 130
+        say(STOPPED.format(name), sys.stderr)
+        return INTERRUPTED
     return 0
+
+
+def _interrupt(name: str, _number: int, _frame: object) -> None:
+    """Stop as Python does, but for certain within a second; a second Ctrl-C stops at once.
+
+    Libraries swallow the exception (trimesh, around imports) or compute on; finished stages lie on
+    the disk as a whole.
+    """
+
+    def leave() -> None:
+        say(STOPPED.format(name), sys.stderr)
+        os._exit(INTERRUPTED)
+
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    last = threading.Timer(PATIENCE, leave)
+    last.daemon = True
+    last.start()
+    raise KeyboardInterrupt
 
 
 def command_of(name: str) -> Callable[[Sequence[str]], None]:
@@ -145,7 +183,10 @@ def command_of(name: str) -> Callable[[Sequence[str]], None]:
 
 
 def say(text: str, stream: Any = None) -> None:  # noqa: ANN401
-    """Write a line to standard output, or to `stream`."""
+    """Write a line to standard output, or to `stream`, in the letters that it knows."""
     where = stream or sys.stdout
-    where.write(text + "\n")
+    if where is None:  # it was closed
+        return
+    known = getattr(where, "encoding", None) or "utf-8"
+    where.write(text.encode(known, "backslashreplace").decode(known) + "\n")
     where.flush()

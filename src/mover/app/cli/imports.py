@@ -224,7 +224,7 @@ def _masks(args: ImportArgs, parts: "Sequence[Parts]", hints: "Hints") -> "list[
 def print_import(imported: "Imported", folder: Path) -> None:
     """Say what the capture has and what it lacks."""
     from mover.io.capture.evidence import evidence_table, gather_evidence
-    from mover.io.capture.pairing import odd_world
+    from mover.io.capture.faults import check_against_picture
 
     say(f"{folder}: wrote {', '.join(imported.written) or 'nothing'}")
     for note in imported.notes:
@@ -232,9 +232,8 @@ def print_import(imported: "Imported", folder: Path) -> None:
     capture = imported.capture
     if capture is not None:
         say(evidence_table(capture, gather_evidence(capture)))
-        odd = odd_world(capture.scene, capture.detections)
-        if odd is not None:
-            say(f"warning: {odd}")
+        for warning in check_against_picture(capture).warnings:
+            say(f"warning: {warning}")
     for text in imported.missing:
         say(f"still missing: {text}")
     if capture is not None:

@@ -21,7 +21,10 @@ class CheckArgs:
     source: Annotated[Positional[Path], arg(metavar="CAPTURE")]
     """The capture folder (or whatever --format reads)."""
     out: Path = Path("check.png")
-    """The picture of the initial scene over the reference image."""
+    """The picture of the initial scene and some bodies over the reference image, with the boxes
+    and masks that were given."""
+    mend: Path | None = None
+    """A new folder for the capture without the faults that are named."""
     format: str = "folder"
     """How the capture is written."""
 
@@ -45,15 +48,22 @@ def check(arguments: Sequence[str]) -> None:
     read = chosen("--format", args.format, "capture")
     from mover.app.pictures.overlay import save_overlay
     from mover.io.capture.evidence import evidence_table, gather_evidence
+    from mover.io.capture.faults import check_against_picture, write_mended
     from mover.pipeline.result import warnings_of
 
     capture = read(args.source)
     warnings, estimates = warnings_of(capture)
     say(evidence_table(capture, gather_evidence(capture)))
     save_overlay(capture, args.out)
-    for warning in warnings:
+    findings = check_against_picture(capture)
+    for warning in dict.fromkeys((*findings.warnings, *warnings)):
         say(f"warning: {warning}")
-    say("\n".join(estimates))
+    if findings.faults and args.mend is None:
+        say(f"a capture without that: mover check {args.source} --mend NEW")
+    say("\n".join((*findings.summary, *estimates)))
+    if args.mend is not None:
+        write_mended(capture, findings, args.source, args.mend)
+        say(f"{args.mend}: wrote the capture without {len(findings.faults)} faults")
     say(f"{args.source} is a valid capture; its initial scene is drawn in {args.out}")
 
 

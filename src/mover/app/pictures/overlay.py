@@ -1,5 +1,6 @@
 """Furniture over the reference image: tinted, shaded, outlined and named."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +10,15 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from mover.app.pictures.film import pixels, save_still, sized
-from mover.app.pictures.paint import FINE, draw_picture, furniture
+from mover.app.pictures.paint import FINE, draw_picture, furniture, people
+from mover.bodies.corrected import in_world
 from mover.core.colours import colour, css
-from mover.core.records import map_tensors
-from mover.core.types import Capture, Scene
+from mover.core.records import map_tensors, rows_of
+from mover.core.types import Capture, Masks, Scene
+from mover.geometry.rle import decode
 
+SOME_BODIES = 5  # in the picture of a check
+WHITE = (1.0, 1.0, 1.0)
 WIDEST = 1280  # [px], of a picture in the report
 
 
@@ -27,10 +32,47 @@ def draw_overlay(image: Float[Tensor, "h w 3"], scene: Scene) -> Float[Tensor, "
 
 
 def save_overlay(capture: Capture, path: Path) -> Path:
-    """Draw the initial scene over the reference image into the file `path` (.png, .jpg, ...)."""
-    scene, image = map_tensors(on_cpu, (capture.scene, capture.reference))
-    save_still(draw_overlay(canvas(image, scene, WIDEST), scene), path)
+    """Draw what was given over the reference image into the file `path` (.png, .jpg, ...).
+
+    The initial scene, some of the bodies, and the boxes and masks that all of it should lie on.
+    """
+    capture = map_tensors(on_cpu, capture)
+    scene, bodies = capture.scene, capture.bodies
+    frames, picture = list[int](), canvas(capture.reference, scene, WIDEST)
+    if bodies is not None:
+        count = len(bodies.frame)
+        rows = torch.linspace(0, count - 1, min(count, SOME_BODIES)).long()
+        frames, some = bodies.frame[rows].tolist(), in_world(rows_of(bodies, rows), scene.camera)
+        picture, _ = draw_picture(people(some, list(range(len(rows)))), scene.camera, picture)
+    picture = draw_overlay(picture, scene)
+    save_still(_given(picture, capture, frames), path)
     return path
+
+
+def _given(
+    picture: Float[Tensor, "h w 3"], capture: Capture, frames: Sequence[int]
+) -> Float[Tensor, "h w 3"]:
+    """Boxes and masks of the furniture in the objects' colours, people's in some frames white."""
+    from scipy.ndimage import binary_erosion
+
+    page, size = Image.fromarray(pixels(picture)), (picture.shape[1], picture.shape[0])
+    pen, camera = ImageDraw.Draw(page), capture.scene.camera
+    zoom = torch.tensor([size[0] / camera.width, size[1] / camera.height] * 2)
+    order = [one.annotation for one in capture.scene.objects]
+    masks: list[tuple[Masks, int, tuple[float, float, float]]] = []
+    for seen in capture.detections:
+        tint = colour(order.index(seen.id)) if seen.id in order else WHITE
+        pen.rectangle((seen.box * zoom).tolist(), outline=css(tint), width=2)
+        masks += [] if seen.mask is None else [(seen.mask, 0, tint)]
+    if capture.people is not None:
+        shown = torch.isin(capture.people.frame, torch.tensor(frames, dtype=torch.long))
+        masks += [(capture.people.masks, row, WHITE) for row in shown.nonzero()[:, 0].tolist()]
+    found = np.asarray(page).copy()
+    for mask, row, tint in masks:
+        shape = Image.fromarray(decode(mask, row).numpy()).resize(size)
+        inside = np.asarray(shape, dtype=np.bool_)
+        found[inside & ~binary_erosion(inside, iterations=2)] = [round(255 * c) for c in tint]
+    return torch.from_numpy(found).float() / 255
 
 
 def on_cpu(tensor: Tensor) -> Tensor:

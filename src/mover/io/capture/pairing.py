@@ -1,31 +1,20 @@
-"""Which annotation shows which object, by outlines in the image; and scenes in an odd world."""
+"""Which annotation shows which object, by outlines in the image."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from mover.core.types import Camera, Detection, Scene, SceneObject
+from mover.core.types import Scene
 from mover.furniture.library import canonical
 from mover.geometry.boxes import iou2d
-from mover.geometry.camera import NEAR, project, to_camera
-from mover.geometry.placement import place_object
+from mover.io.capture.agreement import in_image, outermost, outlines
 from mover.io.capture.parts import UNKNOWN
 from mover.io.files.fields import At, get, items
 
 LEAST = 0.1  # boxes of one class that share less are not of one thing
 OTHER_CLASS = 0.5  # the same, of different classes
-POOR, BETTER = 0.2, 0.4  # mean overlaps of boxes: a scene is odd if another world fits so much more
-OTHERS: dict[str, Float[Tensor, "3 3"]] = {
-    "mirrored (left and right are swapped)": torch.diag(torch.tensor([-1.0, 1.0, 1.0])),
-    "upside down (+y is down)": torch.diag(torch.tensor([1.0, -1.0, -1.0])),
-    "lying on its side (+z is up)": torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
-    "behind the camera (+z is forward)": torch.diag(torch.tensor([-1.0, 1.0, -1.0])),
-}
-Box = tuple[float, ...]
 Row = Mapping[str, Any]
 """An annotation of objects.json with the name of its category as `category_id`."""
 
@@ -70,58 +59,12 @@ def linked(scene: Scene, at: At) -> dict[str, int]:
     used = {p.annotation for p in scene.objects}
     free = [row for row in named_rows(at) if row["id"] not in used]
     bare: list[dict[str, Any]] = []
-    for piece in scene.objects:
-        box = outline(piece, scene.camera) if piece.annotation is None else None
-        if box is not None:
-            x, y, right, bottom = box
+    pieces = [outermost(piece) for piece in scene.objects if piece.annotation is None]
+    for piece, box in zip(
+        pieces, in_image(outlines(pieces, scene.camera), scene.camera).tolist(), strict=True
+    ):
+        x, y, right, bottom = box
+        if x < right and y < bottom:
             size = [x, y, right - x, bottom - y]
             bare.append({"id": piece.id, "category_id": piece.category, "bbox": size})
     return {bare[i]["id"]: free[j]["id"] for i, j in pair_rows(bare, free).items()}
-
-
-def outline(
-    piece: SceneObject, camera: Camera, turn: Float[Tensor, "3 3"] | None = None
-) -> Box | None:
-    """The rectangle around an object in the image, clipped to it; None where it is not visible.
-
-    The world is turned by `turn` before the camera looks at it.
-    """
-    verts = place_object(piece).verts
-    verts = to_camera(verts if turn is None else verts @ turn.mT, camera.R_cam_world)
-    verts = verts[verts[:, 2] > NEAR]
-    if not len(verts):
-        return None
-    pixels = project(verts, camera.K)
-    size = torch.tensor([camera.width, camera.height], dtype=pixels.dtype)
-    low, high = pixels.amin(0).clamp_min(0), torch.minimum(pixels.amax(0), size)
-    if not bool((high > low).all()):
-        return None
-    return tuple(torch.cat([low, high]).double().numpy().tolist())
-
-
-def overlap(
-    scene: Scene, detections: tuple[Detection, ...], turn: Float[Tensor, "3 3"] | None = None
-) -> float | None:
-    """Mean overlap of objects' outlines and detections, the world turned first; None: no pair."""
-    boxes = {d.id: d.box for d in detections}
-    views = [
-        (outline(p, scene.camera, turn), boxes[p.annotation])
-        for p in scene.objects
-        if p.annotation is not None and p.annotation in boxes
-    ]
-    values = [0.0 if ours is None else float(iou2d(torch.tensor(ours), b)) for ours, b in views]
-    return sum(values) / len(values) if values else None
-
-
-def odd_world(scene: Scene, detections: tuple[Detection, ...]) -> str | None:
-    """The fault in the axes of a scene whose objects miss their detections; None without one."""
-    own = overlap(scene, detections)
-    if own is None or own >= POOR:
-        return None
-    found = {name: overlap(scene, detections, turn) or 0.0 for name, turn in OTHERS.items()}
-    name, best = max(found.items(), key=lambda pair: pair[1])
-    if best < BETTER:
-        return None
-    return (
-        f"the scene seems {name}: mean overlap with the detections {own:.2f}, otherwise {best:.2f}"
-    )

@@ -34,7 +34,8 @@ from mover.io.files.schema import Id, Index, Number, Share, Sizes, Text, Vector,
 log = logging.getLogger(__name__)
 
 FORMAT, VERSION = "mover-scene", 1
-SAFE_ID = re.compile(r"\w[\w.-]{0,99}")
+SAFE_ID = re.compile(r"\w[\w.-]*")
+LONGEST_ID = 60  # [bytes]
 WORDS = ("ground", "free")
 LOWEST = 30.0  # [m], of a floor below the camera
 P = TypeVar("P", SceneObject, Segment)
@@ -154,6 +155,8 @@ def check_id(at: At) -> None:
     name = at.value
     if not SAFE_ID.fullmatch(name) or name.casefold() in WORDS or name.endswith("."):
         refuse(at, "letters, digits, '_', '-' or '.', not 'ground' or 'free'")
+    if len(name.encode()) > LONGEST_ID:  # with endings, a file's name has 255 bytes at most
+        refuse(at, f"at most {LONGEST_ID} bytes", f"{len(name.encode())}")
 
 
 def _check_supports(at: At, objects: list[SceneObject]) -> None:
@@ -193,7 +196,8 @@ def write_scene(
 ) -> None:
     """Write a scene: the user's meshes are copied as they are, new ones become meshes/<id>.glb.
 
-    The copy of a mesh whose seat was raised keeps parts, materials and textures (`stretch_file`).
+    The copy of a mesh whose seat was raised, meshes/<id>+seat.glb beside that of the initial scene,
+    keeps parts, materials and textures (`stretch_file`).
 
     Args:
         scene: What is written.
@@ -204,12 +208,13 @@ def write_scene(
     objects: list[dict[str, Any]] = []
     for piece in scene.objects:
         source = Path(piece.mesh_file)
+        name = piece.id if piece.stretch is None else f"{piece.id}+seat"
         if source.is_absolute() and source.is_file():
-            target = copy_mesh(source, meshes, piece.id)
+            target = copy_mesh(source, meshes, name)
             if piece.stretch is not None:
                 target = stretch_file(target, piece.stretch)
         else:
-            target = meshes / f"{piece.id}.glb"
+            target = meshes / f"{name}.glb"
             write_mesh(piece.mesh, target)
         mesh = target.relative_to(path.parent).as_posix()
         annotation = {} if piece.annotation is None else {"annotation": piece.annotation}

@@ -11,8 +11,9 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mover.core.types import Bodies, Camera, Masks, People
+from mover.core.types import Bodies, Camera, People
 from mover.geometry.camera import NEAR, project
+from mover.geometry.rle import mask_boxes
 
 OVERLAP = 0.5  # of a body and a mask of one person, mean of share and union
 CLEAR = 0.3  # by so much the next best pair is worse where there is no uncertainty
@@ -55,7 +56,7 @@ def pair_tracks(bodies: Bodies, people: People, camera: Camera) -> TrackPairs:
     Returns:
         The numbers of the bodies count; those of a mask without a body may change to a free one.
     """
-    ours, theirs = _body_boxes(bodies, camera), _mask_boxes(people.masks)
+    ours, theirs = _body_boxes(bodies, camera), mask_boxes(people.masks).double().numpy()
     scores, margins = defaultdict[Any, list[float]](list), defaultdict[Any, list[float]](list)
     for frame in sorted({*bodies.frame.tolist()} & {*people.frame.tolist()}):
         a, b = ((one.frame == frame).nonzero()[:, 0].numpy() for one in (bodies, people))
@@ -120,16 +121,6 @@ def _body_boxes(bodies: Bodies, camera: Camera) -> NDArray[np.float64]:
     size = torch.tensor([camera.width, camera.height]).to(pixels)
     low, high = pixels.amin(1).clamp_min(0), torch.minimum(pixels.amax(1), size)
     return torch.cat([low, torch.maximum(low, high)], 1).double().numpy()
-
-
-def _mask_boxes(masks: Masks) -> NDArray[np.float64]:
-    """Boxes around the pixels of masks [px]."""
-    from pycocotools import mask as coco
-
-    size = [masks.height, masks.width]
-    codes: Any = [{"size": size, "counts": code} for code in masks.counts]
-    boxes = np.asarray(coco.toBbox(codes), dtype=np.float64)
-    return np.concatenate([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]], 1)
 
 
 def _overlaps(ours: NDArray[np.float64], theirs: NDArray[np.float64]) -> NDArray[np.float64]:

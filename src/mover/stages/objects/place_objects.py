@@ -33,8 +33,8 @@ def place_objects(inputs: PlaceInputs, config: PlaceConfig, observe: Observer = 
 
     def lower(given: PlaceInputs, starts: Layout) -> Placed:
         found = descend(given, config, starts, config.method, observe)
-        order = found.value.argsort(0)
-        candidates, energy = found.at.gather(order), found.value.sort(0).values
+        energy, order = found.value.sort(dim=0, stable=True)
+        candidates = found.at.gather(order)
         at = choose(candidates, energy, given.reference, config.yaw_prior_weight)
         return Placed(at, candidates, energy, found.trace, given.image.walls)
 

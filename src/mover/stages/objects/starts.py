@@ -57,8 +57,9 @@ def best_few(layout: Layout, energy: Float[Tensor, "starts objects"], keep: int)
     """For each object its best starts that really differ, best first.
 
     Where fewer than `keep` differ, the best of the rest fill up, so that all objects have as many.
+    Of equals the first is better: an object without evidence keeps the start that was given.
     """
-    order, near = energy.argsort(0), to_device(layout, "cpu")
+    order, near = energy.argsort(dim=0, stable=True), to_device(layout, "cpu")
     columns = [_differing(near, order[:, i], i) for i in range(order.shape[1])]
     return layout.gather(torch.stack(columns, 1).to(order.device)[:keep])
 

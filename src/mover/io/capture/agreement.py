@@ -1,0 +1,242 @@
+"""How well scene, bodies and masks of a capture lie on each other, on a thinned copy of it."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mover.core.records import rows_of
+from mover.core.types import Bodies, Camera, Capture, Masks, Mesh, People, SceneObject
+from mover.furniture.library import SIZES, canonical
+from mover.geometry.boxes import iou2d
+from mover.geometry.camera import NEAR, project, to_camera
+from mover.geometry.mesh import used
+from mover.geometry.rle import area, mask_boxes
+from mover.geometry.rotations import rot_y
+
+DIRECTIONS = 96  # in which the outermost points of a mesh are kept
+MOST_OBJECTS, MOST_BODIES, MOST_MASKS, POSES = 40, 240, 40, 16
+UPPER, LOWER = ("head", "neck"), "pelvis"
+HEIGHTS = (0.8, 2.3)  # [m], of sitting children and standing adults
+FULL_TURN = 2 * math.pi + 0.01  # [rad], a yaw beyond is hardly in radians
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Shares from 0 to 1 of what fits; empty or NaN: there is nothing to compare."""
+
+    objects: Float[Tensor, " annotated"]
+    """Overlap of the outline's box with the annotation's, of objects that have one."""
+    sizes: Float[Tensor, " known"]
+    """How usual the size is of objects of known classes."""
+    turns: Float[Tensor, " objects"]
+    """Whether a yaw can be one in radians."""
+    object_masks: Float[Tensor, " masked"]
+    """0 for a mask of most of the picture, to its borders; as that of people below."""
+    people_masks: Float[Tensor, " some"]
+    people: Float[Tensor, " rows"]
+    """Overlap of the box of a body with that of its mask; NaN where it has none."""
+    heights: Float[Tensor, " bodies"]
+    """How usual the height of a body is."""
+    upright: Float[Tensor, " bodies"]
+    """1 for a body that stands upright, 0 for one on its head; NaN without joints."""
+    boxes: Float[Tensor, "bodies 4"]
+    """Of bodies, beyond the image's borders, too [px]."""
+
+
+NOTHING = Agreement(*[torch.zeros(0)] * 8, boxes=torch.zeros(0, 4))
+SCORES = (
+    "objects",
+    "sizes",
+    "turns",
+    "object_masks",
+    "people_masks",
+    "people",
+    "heights",
+    "upright",
+)
+
+
+def thinned_capture(capture: Capture) -> Capture:
+    """Few points, objects and bodies, enough for all outlines."""
+    scene, bodies = capture.scene, capture.bodies
+    step = max(1, -(-len(scene.objects) // MOST_OBJECTS))
+    objects = tuple(outermost(one) for one in scene.objects[::step])
+    return replace(
+        capture, scene=replace(scene, objects=objects), reference=None, touch=None, depth=None,
+        bodies=None if bodies is None else _few_points(bodies), hypotheses=(), furniture=None,
+    )  # fmt: skip
+
+
+def outermost(one: SceneObject) -> SceneObject:
+    """The object with the outermost points of its mesh alone."""
+    verts = used(one.mesh).verts
+    few = verts[((verts * one.scale.abs()) @ _directions().mT.to(verts)).argmax(0)]
+    return replace(one, mesh=Mesh(few, torch.arange(DIRECTIONS).reshape(-1, 3)))
+
+
+@lru_cache(1)
+def _directions() -> Float[Tensor, "directions 3"]:
+    """Directions that lie evenly on a sphere (Fibonacci's spiral)."""
+    k = torch.arange(DIRECTIONS) + 0.5
+    y, turn = 1 - 2 * k / DIRECTIONS, k * math.pi * (1 + 5**0.5)
+    r = (1 - y * y).sqrt()
+    return torch.stack([r * turn.cos(), y, r * turn.sin()], -1)
+
+
+def _few_points(bodies: Bodies) -> Bodies:
+    """Some of the bodies, with the vertices that are outermost in some of the poses."""
+    count = len(bodies.frame)
+    rows = torch.linspace(0, count - 1, min(count, MOST_BODIES)).long()
+    few = rows_of(replace(bodies, pose=None), rows)
+    posed = few.verts[torch.linspace(0, len(rows) - 1, min(len(rows), POSES)).long()]
+    points = (posed @ _directions()[::3].mT.to(posed)).argmax(1).unique()
+    return replace(few, verts=few.verts[:, points], faces=torch.zeros(0, 3, dtype=torch.long))
+
+
+def agreement(capture: Capture, other: tuple[Capture, Agreement] | None = None) -> Agreement:
+    """How well the parts of a thinned capture agree; what is as in another is taken from it."""
+    scene, bodies, people = capture.scene, capture.bodies, capture.people
+    before, found = other or (None, NOTHING)
+    new_camera = before is None or scene.camera is not before.scene.camera
+    new_masks = before is None or capture.detections is not before.detections
+    if before is None or new_masks or scene is not before.scene:
+        found = replace(
+            found, objects=_overlaps(capture), sizes=_usual_sizes(scene.objects),
+            turns=torch.tensor([float(abs(float(x.yaw)) < FULL_TURN) for x in scene.objects]),
+        )  # fmt: skip
+    if before is None or new_masks or people is not before.people:
+        people_masks = [] if people is None or not len(people.frame) else [people.masks]
+        object_masks = [d.mask for d in capture.detections if d.mask is not None]
+        found = replace(
+            found, object_masks=_bounded(object_masks), people_masks=_bounded(people_masks)
+        )
+    if bodies is None:
+        return found
+    new_bodies = before is None or bodies is not before.bodies
+    if new_camera or before is None or before.bodies is None or (
+        bodies.verts is not before.bodies.verts
+    ):  # fmt: skip
+        tall = (bodies.verts.amax(1) - bodies.verts.amin(1)).amax(-1)
+        found = replace(
+            found, boxes=box_around(bodies.verts, scene.camera),
+            heights=_within(tall, *HEIGHTS), upright=_upright(bodies, scene.camera),
+        )  # fmt: skip
+    if new_camera or new_bodies or before is None or people is not before.people:
+        boxes = in_image(found.boxes, scene.camera)
+        found = replace(found, people=_on_masks(boxes, bodies, people))
+    return found
+
+
+def _overlaps(capture: Capture) -> Float[Tensor, " annotated"]:
+    """Overlaps of outlines and annotations; where no object has one, those of the best pairs."""
+    objects, boxes = capture.scene.objects, {d.id: d.box for d in capture.detections}
+    if not boxes or not objects:
+        return torch.zeros(0)
+    known = {i: boxes[key] for i, one in enumerate(objects)
+             if (key := one.annotation) is not None and key in boxes}  # fmt: skip
+    ours = in_image(outlines(objects, capture.scene.camera), capture.scene.camera)
+    if known:
+        return iou2d(ours[list(known)], torch.stack(list(known.values())))
+    from scipy.optimize import linear_sum_assignment
+
+    shared = iou2d(*torch.broadcast_tensors(ours[:, None], torch.stack(list(boxes.values()))))
+    rows, columns = linear_sum_assignment(shared.numpy(), maximize=True)
+    return shared[rows, columns]
+
+
+def outlines(objects: Sequence[SceneObject], camera: Camera) -> Float[Tensor, "objects 4"]:
+    """The rectangles around `outermost` points, beyond the image's borders, too [px]."""
+    if not objects:
+        return torch.zeros(0, 4)
+    verts = torch.stack([one.mesh.verts * one.scale for one in objects])
+    R, t = (torch.stack(x) for x in zip(*((rot_y(o.yaw), o.t_world_object) for o in objects),
+                                        strict=True))  # fmt: skip
+    verts = to_camera(verts @ R.mT + t[:, None], camera.R_cam_world)
+    hidden = verts[..., 2] <= NEAR
+    anyone = verts.gather(1, hidden.long().argmin(1)[:, None, None].expand(-1, -1, 3))
+    found = box_around(torch.where(hidden[..., None], anyone, verts), camera)
+    return torch.where(hidden.all(1, keepdim=True), torch.zeros(4), found)
+
+
+def box_around(verts: Float[Tensor, "*b points 3"], camera: Camera) -> Float[Tensor, "*b 4"]:
+    """x_min, y_min, x_max, y_max of points in camera axes [px]."""
+    pixels = project(verts, camera.K)
+    return torch.cat([pixels.amin(-2), pixels.amax(-2)], -1)
+
+
+def in_image(boxes: Float[Tensor, "*b 4"], camera: Camera) -> Float[Tensor, "*b 4"]:
+    """Boxes clipped to the image; without area where they are outside."""
+    size = torch.tensor([camera.width, camera.height] * 2).to(boxes)
+    return torch.minimum(boxes.clamp_min(0), size)
+
+
+def _usual_sizes(objects: Sequence[SceneObject]) -> Float[Tensor, " known"]:
+    """1 where height and longest side are those of its class, falling with the factor beyond."""
+    known = [one for one in objects if canonical(one.category) in SIZES]
+    if not known:
+        return torch.zeros(0)
+    verts = torch.stack([one.mesh.verts * one.scale for one in known])
+    size = verts.amax(1) - verts.amin(1)
+    low, high = torch.tensor([SIZES[canonical(one.category)] for one in known]).unbind(-1)
+    high_and_long = [torch.stack([x[:, 1], x[:, [0, 2]].amax(1)]) for x in (size, low, high)]
+    return _within(*high_and_long).mean(0)
+
+
+def _within(
+    value: Float[Tensor, "*n"], low: Float[Tensor, "*n"] | float, high: Float[Tensor, "*n"] | float
+) -> Float[Tensor, "*n"]:
+    """1 between two bounds, falling with the factor beyond."""
+    value = value.clamp_min(1e-9)
+    return torch.minimum(value / low, high / value).clamp_max(1)
+
+
+def _bounded(every: Sequence[Masks]) -> Float[Tensor, " masks"]:
+    """0 for some of the masks that fill most of the picture to three of its borders, else 1."""
+    found: list[float] = []
+    for masks in every[:MOST_MASKS]:
+        step = -(-len(masks.counts) // MOST_MASKS)
+        few = replace(masks, counts=masks.counts[::step])
+        low, high = mask_boxes(few).split(2, 1)
+        size = torch.tensor([masks.width, masks.height])
+        borders = (low <= 0).sum(1) + (high >= size).sum(1)
+        for row, count in enumerate(borders.tolist()):
+            found.append(float(count < 3 or 2 * area(few, row) < masks.width * masks.height))
+    return torch.tensor(found)
+
+
+def _on_masks(
+    boxes: Float[Tensor, "bodies 4"], bodies: Bodies, people: People | None
+) -> Float[Tensor, " bodies"]:
+    """Overlap of the boxes of bodies and of their masks; NaN where a body has no mask."""
+    found = torch.full((len(bodies.frame),), math.nan)
+    if people is not None and len(people.frame):
+        rows = partners(bodies.frame, bodies.person, people)
+        both = rows >= 0
+        found[both] = iou2d(boxes[both], mask_boxes(people.masks)[rows[both]])
+    return found
+
+
+def partners(
+    frame: Int[Tensor, "*rows"], person: Int[Tensor, "*rows"], people: People
+) -> Int[Tensor, "*rows"]:
+    """Row of the mask of a person in a frame, -1: none."""
+    wide = 1 + max(int(person.max()), int(people.person.max()))
+    ours, theirs = frame * wide + person, people.frame * wide + people.person
+    order = theirs.argsort()
+    row = order[torch.searchsorted(theirs[order], ours).clamp_max(len(order) - 1)]
+    return torch.where(theirs[row] == ours, row, torch.full_like(row, -1))
+
+
+def _upright(bodies: Bodies, camera: Camera) -> Float[Tensor, " bodies"]:
+    """How far bodies stand upright in the world; NaN without joints."""
+    names, joints = bodies.joint_names, bodies.joints
+    upper = next((names.index(n) for n in UPPER if n in names), None)
+    if joints is None or upper is None or LOWER not in names:
+        return torch.full((len(bodies.frame),), math.nan)
+    axis = joints[:, upper] - joints[:, names.index(LOWER)]
+    return ((axis @ camera.R_cam_world[:, 1]) / axis.norm(dim=-1).clamp_min(1e-9) + 1) / 2

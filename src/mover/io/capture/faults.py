@@ -1,0 +1,314 @@
+"""What users get wrong with captures: one table of faults, each with what undoes it and its cure.
+
+A fault is a hypothesis: a capture with it agrees clearly better with itself once it is undone.
+"""
+
+import math
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mover.core.errors import InputError
+from mover.core.types import Camera, Capture
+from mover.furniture.library import canonical
+from mover.geometry.boxes import iou2d
+from mover.geometry.placement import place_object
+from mover.geometry.rle import mask_boxes
+from mover.io.capture import mends
+from mover.io.capture.agreement import (
+    FULL_TURN,
+    SCORES,
+    Agreement,
+    agreement,
+    in_image,
+    outlines,
+    partners,
+    thinned_capture,
+)
+from mover.io.capture.folder import write_capture
+
+MARGIN = 0.06  # a fault is named from this gain on: unharmed known rooms have none above 0.01
+FITTED_MARGIN = 0.12  # the same where numbers are fitted, which fit noise, too
+TIME_MARGIN = 0.02  # of times, which are sharp: unharmed rooms lose .03 by a frame
+MOST_FAULTS = 3  # that are found one after the other
+MOST_SHIFT = 120  # frames
+RATES = (1.2, 1.25, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 10.0)  # between usual frame rates
+UNITS = {"feet": 3.2808, "decimetres": 10.0, "inches": 39.37, "centimetres": 100.0,
+         "millimetres": 1000.0, "kilometres": 0.001, "tens of metres": 0.1}  # fmt: skip
+POOR = 0.2  # mean overlap below which parts of a capture are of different pictures
+FEWEST = 3  # outlines that show a lens, rows that show a time
+SCALES = 1.06 ** torch.arange(-28.0, 29.0)  # between lenses, or sizes
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A hypothesis of what is wrong."""
+
+    name: str
+    cure: str
+    mend: mends.Mend
+    """The capture without it; the same one where it cannot have it."""
+    margin: float = MARGIN
+
+
+@dataclass(frozen=True)
+class Findings:
+    """How well a capture lies on its picture."""
+
+    agreement: Agreement
+    """As it is given."""
+    faults: tuple[Fault, ...]
+    unexplained: tuple[str, ...]
+    """What does not fit, without a hypothesis that explains it."""
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence each."""
+        return (*(f"{fault.name}; {fault.cure}" for fault in self.faults), *self.unexplained)
+
+    @property
+    def summary(self) -> tuple[str, ...]:
+        """How far outlines and masks share the picture, as they are given."""
+        known = {"objects and their annotations": self.agreement.objects,
+                 "bodies and their masks": self.agreement.people}  # fmt: skip
+        return tuple(f"in the picture, {name} share {100 * mean(score):.0f} % of their boxes"
+                     for name, score in known.items() if not bool(score.isnan().all()))  # fmt: skip
+
+
+def check_against_picture(capture: Capture) -> Findings:
+    """Hold scene, bodies and masks of a capture against each other: all lie in one picture."""
+    thin = thinned_capture(capture)
+    own = found = agreement(thin)
+    faults: list[Fault] = []
+    while len(faults) < MOST_FAULTS:
+        best, least = None, 0.0
+        for fault in hypotheses(thin, found):
+            other = fault.mend(thin)
+            gain = _gain(found, agreement(other, (thin, found))) - fault.margin
+            if other is not thin and gain > least:
+                best, least = fault, gain
+        if best is None:
+            break
+        thin = best.mend(thin)
+        found = agreement(thin)
+        faults.append(best)
+    return Findings(own, tuple(faults), tuple(_unexplained(found)))
+
+
+def write_mended(capture: Capture, findings: Findings, source: Path, folder: Path) -> None:
+    """Write a capture without its faults; what else is in its folder is copied.
+
+    Raises:
+        InputError: If there is such a folder already.
+    """
+    if folder.exists():
+        raise InputError(f"{folder}: is there already, expected a new folder for the capture")
+    if (source / "scene.json").is_file():
+        shutil.copytree(source, folder)
+    for fault in findings.faults:
+        capture = fault.mend(capture)
+    write_capture(capture, folder)
+
+
+def mean(score: Float[Tensor, " n"]) -> float:
+    """Of what can be compared; 0 where nothing can."""
+    known = score[~score.isnan()]
+    return float(known.mean()) if len(known) else 0.0
+
+
+def _gain(own: Agreement, other: Agreement) -> float:
+    """By how much the scores of another capture are better; none where masks lose their bodies."""
+    before, after = (int((~one.people.isnan()).sum()) for one in (own, other))
+    pairs = [(getattr(own, name), getattr(other, name)) for name in SCORES]
+    return -1.0 if after < before / 2 else sum(mean(b) - mean(a) for a, b in pairs)
+
+
+def _unexplained(found: Agreement) -> Iterator[str]:
+    """What fits nothing, and that nothing could be compared."""
+    rows, both = int((~found.people.isnan()).sum()), "(mean overlap in the picture {:.2f})"
+    if not len(found.objects) and not rows:
+        yield "nothing could be held against the picture: no object or body has a box or a mask"
+    if len(found.objects) > 1 and mean(found.objects) < POOR:
+        missed = f"scene.json: the objects miss their annotations {both}".format
+        yield f"{missed(mean(found.objects))}; are scene, camera and picture of one room?"
+    if rows >= FEWEST and mean(found.people) < POOR:
+        missed = f"bodies.npz: the bodies miss their masks {both}".format
+        yield f"{missed(mean(found.people))}; are bodies, masks and camera of one video?"
+
+
+# The table.
+
+
+WORLDS = {
+    "lying on its side (+z is up)": ("x z -y", 1, "turn it so that +y is up (import: --up z)"),
+    "upside down (+y is down)": ("x -y -z", -1, "turn it so that +y is up (import: --up=-y)"),
+    "upside down (only y is turned)": ("x -y z", 1, "change the sign of y"),
+    "behind the camera (+z is forward)": ("x y -z", -1, "the camera looks along -z"),
+    "turned round (+z is forward)": ("-x y -z", 1, "the camera looks along -z"),
+    "mirrored (left and right are swapped)": ("-x y z", -1, "change the sign of x"),
+    "of another handedness (y and z are swapped)": ("x z y", -1, "exchange y and z"),
+}  # fmt: skip
+"""Worlds in which a scene may be: its axes, the sign of yaw, and what helps."""
+PEOPLE = {"mirrored": "-x y z", "flipped": "x -y z", "upside down": "-x -y z"}
+UP = "R_cam_world maps the world (+y up) to the camera (x right, y down, z forward)"
+
+
+def hypotheses(capture: Capture, found: Agreement) -> Iterator[Fault]:
+    """All faults that a (thinned) capture may have; of equals, the first is meant."""
+    yield from _worlds()
+    for unit, k in UNITS.items():
+        cure, scale = f"multiply by {1 / k:.4g}", mends.scaled
+        for what, by in (
+            ("scene.json: sizes and positions", partial(mends.each, scale(1 / k, 1 / k))),
+            ("scene.json: sizes", partial(mends.each, scale(1 / k, 1))),
+            ("scene.json: positions", partial(mends.each, scale(1, 1 / k))),
+            ("bodies.npz: vertices", partial(mends.people, torch.eye(3) / k)),
+        ):
+            yield Fault(f"{what} are in {unit}", cure, by)
+    yaws = torch.stack([*(one.yaw for one in capture.scene.objects), torch.zeros(())])
+    if float(yaws.abs().max()) > FULL_TURN or bool((yaws == yaws.round()).all()):
+        mend = partial(mends.each, mends.in_radians)
+        yield Fault("scene.json: 'yaw' is in degrees", "give it in radians", mend)
+    for what, mend in (
+        ("looks up instead of down, or down instead of up", partial(mends.tilt, -1, 0.0)),
+        ("is upside down", partial(mends.tilt, -1, math.pi)),
+        ("is upside down, as is the scene", mends.head_up),
+    ):
+        yield Fault(f"camera.json: the camera {what}", UP, mend)
+    yield Fault("people.json: the masks are inverted", "invert them", mends.inverted_people)
+    yield Fault("objects.json: the masks are inverted", "invert them", mends.inverted_objects)
+    for name, axes in PEOPLE.items():
+        cure = "the camera's axes are x right, y down, z forward"
+        mend = partial(mends.people, mends.axes(axes))
+        yield Fault(f"bodies.npz: the bodies are {name} in the picture", cure, mend)
+    yield Fault("bodies.npz: the bodies are in the world", "'space' is world", mends.from_world)
+    tracks = "people.json: masks and bodies of one person have different tracks"
+    yield Fault(tracks, "give both the same", mends.same_tracks)
+    for fitted in (_times, _annotations, _lenses):
+        yield from fitted(capture, found)
+
+
+def _worlds() -> Iterator[Fault]:
+    """Other axes of positions, of all, and of meshes, whose front a box does not show."""
+    for name, (rows, sign, cure) in WORLDS.items():
+        A = mends.axes(rows)
+        for what, change in (
+            ("the world is", partial(mends.placed, A, sign)),
+            ("world and meshes are", lambda x, A=A: mends.baked(place_object(x).verts @ A.mT, x)),
+            ("the meshes are", partial(mends.remeshed, A)),
+        ):
+            if what != "the meshes are" or (A[1, 1] != 1 and A.det() > 0):
+                yield Fault(f"scene.json: {what} {name}", cure, partial(mends.each, change))
+    twice = partial(mends.each, lambda one: mends.baked(one.mesh.verts, one))
+    cure = "they are in the world already: translation 0, yaw 0, scale 1"
+    yield Fault("scene.json: the meshes are placed twice", cure, twice)
+
+
+# What is fitted: times, tracks, annotations and lenses.
+
+
+def _times(capture: Capture, found: Agreement) -> Iterator[Fault]:
+    """The best of shifts, rates and reversal."""
+    bodies, people = capture.bodies, capture.people
+    if bodies is None or people is None or not len(people.frame):
+        return
+    ends = int(bodies.frame.min() + bodies.frame.max())
+    changes: dict[str, tuple[float, int]] = {"the frames run backwards": (-1, ends)}
+    for n in range(1, MOST_SHIFT + 1):
+        count = f"{n} frames" if n > 1 else "1 frame"
+        changes |= {
+            f"the bodies are {count} late": (1, -n),
+            f"the bodies are {count} early": (1, n),
+        }
+    for rate in RATES:
+        changes[f"the bodies have {rate:g} times too few frames a second"] = (rate, 0)
+        changes[f"the bodies have {rate:g} times too many frames a second"] = (1 / rate, 0)
+    frames = torch.stack([mends.frames(bodies.frame, *change) for change in changes.values()])
+    rows = partners(frames, bodies.person.expand_as(frames), people)
+    masks = mask_boxes(people.masks)[rows]
+    fits = iou2d(in_image(found.boxes, capture.scene.camera).expand_as(masks), masks)
+    shared = (rows >= 0).sum(1)
+    fits = fits.where(rows >= 0, torch.zeros(())).sum(1) / shared.clamp_min(1)
+    fits[shared < max(FEWEST, int(shared.max()) / 2)] = -1
+    name = list(changes)[int(fits.argmax())]
+    cure = "number the frames of bodies and masks as those of one video (--fps), from 0"
+    yield Fault(f"bodies.npz: {name}", cure, partial(mends.retimed, *changes[name]), TIME_MARGIN)
+
+
+def _views(capture: Capture) -> tuple[list[int], Float[Tensor, "n 4"], Float[Tensor, "n 4"]]:
+    """Objects with an annotation, their outlines and the annotation's boxes."""
+    objects, known = capture.scene.objects, {d.id: d.box for d in capture.detections}
+    rows = [i for i, one in enumerate(objects) if one.annotation in known]
+    if not rows:
+        return [], torch.zeros(0, 4), torch.zeros(0, 4)
+    theirs = torch.stack([known[key] for i in rows if (key := objects[i].annotation) is not None])
+    return rows, outlines([objects[i] for i in rows], capture.scene.camera), theirs
+
+
+def _annotations(capture: Capture, found: Agreement) -> Iterator[Fault]:
+    """Annotations that objects of one class have exchanged."""
+    del found
+    known, ours, theirs = _views(capture)
+    ours = in_image(ours, capture.scene.camera)
+    some = [capture.scene.objects[i] for i in known]
+    kinds = [canonical(one.category) for one in some]
+    shared = iou2d(*torch.broadcast_tensors(ours[:, None], theirs[None]))
+    shared = shared * torch.tensor([[float(a == b) for b in kinds] for a in kinds])
+    pairs = mends.assigned(shared, POOR) if len(some) > 1 else []
+    new = {some[i].id: some[j].annotation for i, j in pairs if i != j}
+    if new and set(new.values()) == {one.annotation for one in some if one.id in new}:
+        text = ", ".join(f"{name} has {number}" for name, number in new.items())
+        change = partial(mends.each, lambda x: replace(x, annotation=new.get(x.id, x.annotation)))
+        yield Fault(f"scene.json: annotations are exchanged (by place, {text})", "exchange them",
+                    change)  # fmt: skip
+
+
+def _lenses(capture: Capture, found: Agreement) -> Iterator[Fault]:
+    """Outlines fit boxes that are scaled and moved: another lens, another size, a crop."""
+    camera, bodies, people = capture.scene.camera, capture.bodies, capture.people
+    _, ours, theirs = _views(capture)
+    k, _ = _fitted(ours, theirs, camera, (ours[:, :2] + ours[:, 2:]) / 2)
+    what = f"{1 / k:.2g} times too large" if k < 1 else f"{k:.2g} times too small"
+    mend, cure = partial(mends.each, mends.scaled(k, 1)), f"multiply 'scale' by {k:.2g}"
+    yield Fault(f"scene.json: sizes are {what} for the positions", cure, mend, FITTED_MARGIN)
+    seen = masks = ours[:0]
+    if bodies is not None and people is not None and len(people.frame):
+        rows = partners(bodies.frame, bodies.person, people)
+        seen, masks = found.boxes[rows >= 0], mask_boxes(people.masks)[rows[rows >= 0]]
+    for file, what, some, others in (
+        ("camera.json", "all", torch.cat([ours, seen]), torch.cat([theirs, masks])),
+        ("camera.json", "the scene", ours, theirs),
+        ("bodies.npz", "the bodies", seen, masks),
+    ):
+        scale, move = _fitted(some, others, camera, camera.K[:2, 2])
+        K = camera.K * torch.tensor([[scale], [scale], [1.0]])
+        K[:2, 2] = camera.K[:2, 2] + move
+        mend = partial(mends.seen_by, replace(camera, K=K))
+        if some is seen:
+            mend = partial(mends.people, torch.linalg.inv(camera.K) @ K)
+        lens = f"fl_x {float(K[0, 0]):.4g}, cx {float(K[0, 2]):.4g}, cy {float(K[1, 2]):.4g}"
+        name = f"{file}: another lens or crop of the picture fits {what} better, about {lens}"
+        yield Fault(name, "give the camera of this picture (--camera)", mend, FITTED_MARGIN)
+
+
+def _fitted(
+    ours: Float[Tensor, "n 4"], theirs: Float[Tensor, "n 4"], camera: Camera,
+    pivot: Float[Tensor, "*n 2"],
+) -> tuple[float, Float[Tensor, "2"]]:  # fmt: skip
+    """Scale about points and shift in the picture [px] with which boxes lie on others best."""
+    if len(ours) < FEWEST:
+        return 1.0, torch.zeros(2)
+    pivot = torch.cat([pivot, pivot], -1)
+    grown = pivot + SCALES[:, None, None] * (ours - pivot)
+    apart = theirs - in_image(grown, camera)
+    moves = ((apart[..., :2] + apart[..., 2:]) / 2).median(1).values
+    moves = torch.cat([torch.zeros_like(moves), moves])
+    boxes = in_image(torch.cat([grown, grown]) + moves.repeat(1, 2)[:, None], camera)
+    best = int(iou2d(boxes, theirs.expand_as(boxes)).mean(1).argmax())
+    return float(SCALES[best % len(SCALES)]), moves[best]

@@ -1,0 +1,179 @@
+"""What undoes a fault of a capture: functions from captures to captures."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mover.core.types import Camera, Capture, Detection, Masks, SceneObject, Segment
+from mover.geometry.camera import pitch_roll, tilted
+from mover.geometry.rle import decode, run_lengths, tight_box
+from mover.io.capture.tracks import pair_tracks, paired
+
+Mend = Callable[[Capture], Capture]
+Change = Callable[[SceneObject], SceneObject]
+Matrix = Float[Tensor, "3 3"]
+
+
+def axes(rows: str) -> Matrix:
+    """`x z -y` maps (x, y, z) to (x, z, -y)."""
+    return torch.tensor([[(-1.0 if word[0] == "-" else 1.0) * (word[-1] == axis) for axis in "xyz"]
+                         for word in rows.split()])  # fmt: skip
+
+
+# The scene
+
+
+def each(change: Change, capture: Capture) -> Capture:
+    """All objects changed, and their other hypotheses."""
+    scene = capture.scene
+    objects, others = (tuple(map(change, some)) for some in (scene.objects, capture.hypotheses))
+    return replace(capture, scene=replace(scene, objects=objects), hypotheses=others)
+
+
+def placed(A: Matrix, sign: float, one: SceneObject) -> SceneObject:
+    """The upright object at its position in another world."""
+
+    def carried(place: SceneObject | Segment) -> dict[str, Tensor]:
+        return {"t_world_object": A @ place.t_world_object, "yaw": sign * place.yaw}
+
+    segments = tuple(replace(part, **carried(part)) for part in one.segments)
+    return replace(one, **carried(one), segments=segments)
+
+
+def baked(verts: Float[Tensor, "verts 3"], one: SceneObject) -> SceneObject:
+    """The object whose mesh is placed already."""
+    middle = (verts.amin(0) + verts.amax(0)) / 2
+    return replace(
+        one, mesh=replace(one.mesh, verts=verts - middle), mesh_file="", t_world_object=middle,
+        yaw=torch.zeros(()), scale=torch.ones(3), segments=(),
+    )  # fmt: skip
+
+
+def remeshed(A: Matrix, one: SceneObject) -> SceneObject:
+    """The object whose mesh has other axes."""
+    mesh = replace(one.mesh, verts=one.mesh.verts @ A.mT)
+    return replace(one, mesh=mesh, mesh_file="", scale=A.abs() @ one.scale)
+
+
+def scaled(size: float, away: float) -> Change:
+    """Objects of other sizes and at other distances."""
+
+    def change(one: SceneObject) -> SceneObject:
+        found = placed(away * torch.eye(3), 1, one)
+        return replace(found, scale=found.scale * size)
+
+    return change
+
+
+def in_radians(one: SceneObject) -> SceneObject:
+    """The object whose yaw was in degrees."""
+    parts = tuple(replace(part, yaw=part.yaw.deg2rad()) for part in one.segments)
+    return replace(one, yaw=one.yaw.deg2rad(), segments=parts)
+
+
+# The camera
+
+
+def seen_by(camera: Camera, capture: Capture) -> Capture:
+    """Another camera in the same world."""
+    return replace(capture, scene=replace(capture.scene, camera=camera))
+
+
+def tilt(sign: float, roll: float, capture: Capture) -> Capture:
+    """The pitch of the other sign, and a further roll."""
+    camera = capture.scene.camera
+    pitch, old = pitch_roll(camera.R_cam_world)
+    return seen_by(replace(camera, R_cam_world=tilted(sign * pitch, old + roll)), capture)
+
+
+def head_up(capture: Capture) -> Capture:
+    """The other way up, with all that was placed before the camera."""
+    new = tilt(-1, math.pi, capture)
+    A = new.scene.camera.R_cam_world.mT @ capture.scene.camera.R_cam_world
+    return each(partial(placed, A, -1), new)
+
+
+# People and masks
+
+
+def people(A: Matrix, capture: Capture) -> Capture:
+    """Bodies in other axes of the camera, as meshes."""
+    bodies = capture.bodies
+    if bodies is None:
+        return capture
+    joints = None if bodies.joints is None else bodies.joints @ A.mT
+    moved = replace(bodies, verts=bodies.verts @ A.mT, joints=joints, pose=None)
+    return replace(capture, bodies=moved)
+
+
+def from_world(capture: Capture) -> Capture:
+    """Bodies that were in the world."""
+    return people(capture.scene.camera.R_cam_world, capture)
+
+
+def frames(frame: Int[Tensor, " rows"], rate: float, shift: int) -> Int[Tensor, " rows"]:
+    """Frames counted otherwise."""
+    return (frame * rate).round().long() + shift
+
+
+def retimed(rate: float, shift: int, capture: Capture) -> Capture:
+    """Bodies in other frames."""
+    assert capture.bodies is not None
+    new = frames(capture.bodies.frame, rate, shift)
+    return replace(capture, bodies=replace(capture.bodies, frame=new))
+
+
+def inverted_people(capture: Capture) -> Capture:
+    """The background of people's masks."""
+    seen = capture.people
+    return replace(capture, people=replace(seen, masks=_inverted(seen.masks))) if seen else capture
+
+
+def inverted_objects(capture: Capture) -> Capture:
+    """The background of the furniture's masks, and its boxes."""
+
+    def other(one: Detection) -> Detection:
+        mask = None if one.mask is None else _inverted(one.mask)
+        if mask is None or not run_lengths(mask.counts[0])[1::2].sum():
+            return one
+        return replace(one, mask=mask, box=tight_box(decode(mask, 0)).to(one.box))
+
+    return replace(capture, detections=tuple(map(other, capture.detections)))
+
+
+def _inverted(masks: Masks) -> Masks:
+    from pycocotools import mask as coco
+
+    height, width, codes = masks.height, masks.width, list[bytes]()
+    for code in masks.counts:
+        runs = run_lengths(code)
+        runs = runs[1:] if runs[0] == 0 else np.concatenate([[0], runs])
+        tree: Any = {"counts": runs.tolist(), "size": [height, width]}
+        codes.append(coco.frPyObjects(tree, height, width)["counts"])
+    return replace(masks, counts=tuple(codes))
+
+
+def same_tracks(capture: Capture) -> Capture:
+    """Bodies and masks paired by their positions in the image."""
+    bodies, seen = capture.bodies, capture.people
+    if bodies is None or seen is None:
+        return capture
+    pairs = pair_tracks(bodies, seen, capture.scene.camera)
+    bodies, seen = paired(bodies, seen, pairs)
+    return replace(capture, bodies=bodies, people=seen) if pairs.notes else capture
+
+
+def assigned(shared: Float[Tensor, "rows columns"], least: float) -> list[tuple[int, int]]:
+    """Pairs with the greatest sum, of those that share enough."""
+    from scipy.optimize import linear_sum_assignment
+
+    rows, columns = linear_sum_assignment(shared.numpy(), maximize=True)
+    pairs = zip(rows.tolist(), columns.tolist(), strict=True)
+    return [(i, j) for i, j in pairs if shared[i, j] >= least]

@@ -1,0 +1,120 @@
+"""Scene, bodies and masks are held against each other, and what is wrong is named."""
+
+import importlib.util
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from little_room import room, walkers
+
+from mover.core.types import Bodies, Capture, Detection, Masks, People
+from mover.geometry.camera import to_camera
+from mover.geometry.rle import encode
+from mover.io.capture.agreement import (
+    agreement,
+    box_around,
+    in_image,
+    outermost,
+    outlines,
+    thinned_capture,
+)
+from mover.io.capture.faults import check_against_picture, write_mended
+from mover.io.capture.folder import read_capture, write_capture
+
+FILE = Path(__file__).parents[1] / "benchmarks" / "faults.py"
+SPEC = importlib.util.spec_from_file_location("faults_of_users", FILE)
+assert SPEC is not None
+assert SPEC.loader is not None
+bench = importlib.util.module_from_spec(SPEC)
+sys.modules[SPEC.name] = bench
+SPEC.loader.exec_module(bench)
+
+
+def masks_of(boxes: torch.Tensor, width: int, height: int) -> Masks:
+    """Full boxes as masks."""
+    codes = []
+    for left, top, right, bottom in boxes.round().long().tolist():
+        mask = torch.zeros(height, width, dtype=torch.bool)
+        mask[top:bottom, left:right] = True
+        codes.append(encode(mask))
+    return Masks(height, width, tuple(codes))
+
+
+@pytest.fixture(scope="module")
+def right() -> Capture:
+    """A capture whose parts lie on each other exactly."""
+    scene, walking = room(), walkers(people=2)
+    camera, size = scene.camera, (scene.camera.width, scene.camera.height)
+    scene = replace(scene, objects=tuple(
+        replace(one, annotation=k) for k, one in enumerate(scene.objects)))  # fmt: skip
+    boxes = in_image(outlines([outermost(one) for one in scene.objects], camera), camera)
+    detections = tuple(
+        Detection(k, one.category, box, masks_of(box[None], *size), 1.0)
+        for k, (one, box) in enumerate(zip(scene.objects, boxes, strict=True))
+    )
+    verts = to_camera(walking.verts, camera.R_cam_world)
+    low, high = verts.amin(1), verts.amax(1)
+    middle = (low + high) / 2
+    up = camera.R_cam_world[:, 1]
+    bodies = Bodies(
+        verts, walking.faces, torch.stack([middle, middle + 0.6 * up], 1), ("pelvis", "head"),
+        walking.frame, walking.person, 15.0, "camera", None,
+    )  # fmt: skip
+    people = People(
+        masks_of(in_image(box_around(verts, camera), camera), *size),
+        bodies.frame,
+        bodies.person,
+        {},
+    )
+    return Capture("right", scene, None, detections, None, None, bodies, people, None, ())
+
+
+def test_what_lies_on_its_picture_has_no_fault(right: Capture) -> None:
+    assert check_against_picture(right).warnings == ()
+
+
+@pytest.mark.parametrize("name", bench.FAULTS)
+def test_a_fault_is_named_and_mended(right: Capture, name: str) -> None:
+    words, change = bench.FAULTS[name]
+    harmed = change(right)
+    if harmed is None:
+        pytest.skip("this room has nothing that shows it")
+    findings = check_against_picture(harmed)
+    assert any(words in text for text in findings.warnings), findings.warnings
+    for fault in findings.faults:
+        harmed = fault.mend(harmed)
+    mended = agreement(thinned_capture(harmed))
+    assert float(mended.objects.mean()) > 0.9
+    assert float(mended.people.nanmean()) > 0.9
+
+
+def test_parts_of_different_pictures_and_nothing_to_compare_are_said(right: Capture) -> None:
+    boxes = [torch.tensor([600.0 - 20 * k, 5, 610 - 20 * k, 10]) for k in range(3)]
+    elsewhere = tuple(
+        replace(one, box=box, mask=None) for one, box in zip(right.detections, boxes, strict=True)
+    )
+    (said,) = check_against_picture(
+        replace(right, detections=elsewhere, bodies=None, people=None)
+    ).warnings
+    assert "one room" in said
+    bare = replace(right, detections=(), people=None)
+    (said,) = check_against_picture(bare).warnings
+    assert "nothing could be held against the picture" in said
+
+
+def test_a_mended_capture_is_written_beside_the_given_one(right: Capture, tmp_path: Path) -> None:
+    harmed = bench.FAULTS["bodies 5 frames late"][1](right)
+    write_capture(harmed, tmp_path / "in")
+    (tmp_path / "in" / "notes.txt").write_text("mine")
+    given = read_capture(tmp_path / "in")
+    write_mended(given, check_against_picture(given), tmp_path / "in", tmp_path / "out")
+    assert (tmp_path / "out" / "notes.txt").read_text() == "mine"
+    found = read_capture(tmp_path / "out")
+    assert found.bodies is not None
+    assert right.bodies is not None
+    assert torch.equal(found.bodies.frame, right.bodies.frame)
+    assert check_against_picture(found).warnings == ()
+    with pytest.raises(Exception, match="there already"):
+        write_mended(given, check_against_picture(given), tmp_path / "in", tmp_path / "out")
