@@ -43,7 +43,7 @@ UNITS = {"feet": 3.2808, "decimetres": 10.0, "inches": 39.37, "centimetres": 100
          "millimetres": 1000.0, "kilometres": 0.001, "tens of metres": 0.1}  # fmt: skip
 POOR = 0.2  # mean overlap below which parts of a capture are of different pictures
 FEWEST = 3  # outlines that show a lens, rows that show a time
-SCALES = 1.06 ** torch.arange(-28.0, 29.0)  # between lenses, or sizes
+SCALES = 1.03 ** torch.arange(-55.0, 56.0)  # between lenses, or sizes
 
 
 @dataclass(frozen=True)
