@@ -8,6 +8,7 @@ import ast
 import re
 from collections import Counter
 from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -53,6 +54,9 @@ PHRASES = (
     r"\bwho (lies|sits|stands|is seated|lay)\b",
     r"\bwhat (lies|carries|hides) (it|them|who)\b",
 )
+PLAIN = re.compile(rf"(?<![a-z_])(?:{'|'.join(WORDS)})(?![a-z_])")
+IN_A_NAME = re.compile(rf"(?<=_)(?:{'|'.join(WORDS)})\b|\b(?:{'|'.join(WORDS)})(?=_)")
+PHRASE = re.compile("|".join(f"(?:{phrase})" for phrase in PHRASES))
 SMALL = 6  # lines of the body of a helper that is better written where it is called
 
 
@@ -72,13 +76,11 @@ def words_of(paths: Iterable[Path]) -> Counter[str]:
     for path in paths:
         text = path.read_text(encoding="utf-8").lower()
         name = str(path.relative_to(HOME))
-        for word in WORDS:
-            found[name] += len(re.findall(rf"(?<![a-z_]){word}(?![a-z_])", text))
-            found[name] += len(re.findall(rf"(?<=_){word}\b|\b{word}(?=_)", text))
-        found[name] += sum(len(re.findall(phrase, text)) for phrase in PHRASES)
+        found[name] += sum(len(pattern.findall(text)) for pattern in (PLAIN, IN_A_NAME, PHRASE))
     return +found
 
 
+@cache
 def trees() -> dict[Path, ast.Module]:
     """The syntax of each file of the program."""
     return {path: ast.parse(path.read_text(encoding="utf-8")) for path in python("src/mover")}
