@@ -1,19 +1,23 @@
 """Which numbers are one person: of bodies and masks by position, of pieces, of two files."""
 
 import functools
+import json
 import re
 from dataclasses import replace
+from pathlib import Path
 
+import little_room
 import numpy as np
 import pytest
 import torch
 
 from mover.core.errors import InputError
-from mover.core.types import Bodies, Camera, Masks, People
+from mover.core.types import Bodies, Camera, Capture, Masks, People
 from mover.geometry.camera import project
 from mover.geometry.rle import encode
 from mover.io.capture.bodies_file import bodies_of, bodies_to_arrays
-from mover.io.capture.merge import _added
+from mover.io.capture.folder import read_capture, write_capture
+from mover.io.capture.merge import _added, import_into
 from mover.io.capture.parts import Parts
 from mover.io.capture.tracks import join_pieces, pair_tracks, paired
 from mover.io.files.fields import At
@@ -83,6 +87,42 @@ def test_pieces_are_one_person_where_the_other_side_is_whole():
     assert (pairs.bodies, pairs.masks) == ({9: 0}, {})
     pairs = pair_tracks(bodies_of_rows(rows), masks_of(cut), CAMERA)
     assert (pairs.bodies, pairs.masks) == ({}, {9: 0})
+
+
+HEIGHTS = {  # bodies' and masks' numbers of two people; heights by the old and the new ones
+    "swapped": ((0, 1), (1, 0), {"0": 1.5, "1": 1.8}, {"1": 1.5, "0": 1.8}),
+    "of another tool": ((7, 0), (1, 2), {"2": 1.5, "1": 1.8, "9": 2},
+                        {"0": 1.5, "7": 1.8, "9": 2}),
+    "a taken number": ((2,), (0, 2), {"2": 1.5, "0": 1.8}, {"3": 1.5, "2": 1.8}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", HEIGHTS)
+def test_heights_in_a_written_capture_follow_the_new_numbers(case: str, tmp_path: Path):
+    ours, theirs, given, wanted = HEIGHTS[case]
+    rows = [row for row in walkers(*ours, *[99][: 2 - len(ours)]) if row[1] != 99]
+    people = replace(masks_of(walkers(*theirs)), heights=given)
+    scene = replace(little_room.room(), camera=CAMERA, objects=())
+    write_capture(Capture(
+        "room", scene, None, (), None, None, bodies_of_rows(rows), people, None, (),
+    ), tmp_path)  # fmt: skip
+    capture = read_capture(tmp_path)
+    assert capture.people is not None
+    assert capture.people.heights == wanted
+    import_into(tmp_path, Parts("", bodies=At(bodies_to_arrays(bodies_of_rows(rows)), "b.npz")))
+    info = json.loads((tmp_path / "people.json").read_text())["info"]
+    assert info["heights"] == wanted
+    unknown = [text for text in read_capture(tmp_path).warnings if "unknown track 9" in text]
+    assert bool(unknown) == ("9" in given)
+
+
+def test_heights_of_bodies_without_masks_follow_their_pieces():
+    rows = walkers(0, 1)
+    cut = [(f, 9 if p == 0 and f > 5 else p, place) for f, p, place in rows]
+    people = replace(masks_of(rows), heights={"9": 1.7, "1": 1.8})
+    bodies = bodies_of_rows(cut)
+    _, masks = paired(bodies, people, pair_tracks(bodies, people, CAMERA))
+    assert masks.heights == {"0": 1.7, "1": 1.8}
 
 
 def test_what_is_uncertain_keeps_its_number():

@@ -10,6 +10,8 @@ from collections.abc import Generator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from mover.core.errors import InputError
+
 LEFT = 3600  # [s], no file is written for so long
 INSTEAD = {
     rb"version https://git-lfs": "it is a pointer of Git LFS, not the file: run `git lfs pull`",
@@ -64,3 +66,10 @@ def reason(error: Exception, path: Path | None = None) -> str:
     if spoken and str(error):
         return " ".join(str(error).split())[:160]
     return "it is damaged, cut off or of another kind"
+
+
+def unreadable(path: Path, why: Exception | str, expected: str) -> InputError:
+    """The error of a file that cannot be read, to be raised."""
+    said = reason(ValueError(why) if isinstance(why, str) else why, path)
+    name = path.name or path.resolve().name
+    return InputError(f"{name}: cannot be read ({said}), expected {expected}")

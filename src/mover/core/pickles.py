@@ -24,7 +24,7 @@ import torch
 from numpy.lib import format as npy
 
 from mover.core.errors import InputError
-from mover.core.files import reason
+from mover.core.files import unreadable
 from mover.core.records import BROKEN
 
 LARGEST = 2 << 30
@@ -90,8 +90,7 @@ def load_plain(path: Path) -> Any:  # noqa: ANN401
     except InputError as error:
         raise InputError(f"{name}: {error}") from error
     except BROKEN_PICKLE as error:
-        why = reason(error, path)
-        raise InputError(f"{name}: cannot be read ({why}), expected a pickle of arrays") from error
+        raise unreadable(path, error, "a pickle of arrays") from error
 
 
 def _loaded(data: bytes) -> Any:  # noqa: ANN401

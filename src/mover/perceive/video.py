@@ -16,7 +16,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from mover.core.errors import InputError
-from mover.core.files import reason, replacing
+from mover.core.files import replacing, unreadable
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import fingerprint, record
 from mover.io.files.images import opened
@@ -151,9 +151,7 @@ def read_frames(source: Path, config: FramesConfig) -> Iterator[Timed]:
     try:
         yield from _decoded(source)
     except (OSError, ValueError) as error:  # av's errors are of both kinds
-        raise InputError(
-            f"{source.name}: cannot be read ({reason(error, source)}), expected a video"
-        ) from error
+        raise unreadable(source, error, "a video") from error
 
 
 def chosen(
@@ -243,9 +241,7 @@ def _opened(source: Path) -> Any:  # noqa: ANN401
     try:
         container = av.open(str(source))
     except (OSError, ValueError) as error:
-        raise InputError(
-            f"{source.name}: cannot be read ({reason(error, source)}), expected a video"
-        ) from error
+        raise unreadable(source, error, "a video") from error
     if not container.streams.video:
         raise InputError(f"{source.name}: has no pictures, only sound, expected a video")
     return container

@@ -11,6 +11,7 @@ from msgspec import Meta, Struct
 from torch import Tensor
 
 from mover.core.types import Camera, Detection, Masks, People
+from mover.geometry.boxes import iou2d
 from mover.geometry.rle import area, decode, joined, tight_box
 from mover.io.files.fields import At, Warn, get, items, listed, maybe, plain, refuse, shown, unique
 from mover.io.files.schema import Box, FrameRate, Id, Index, Share, checked
@@ -92,11 +93,7 @@ def _check_mask(at: At, mask: Masks, box: Float[Tensor, "4"], warn: Warn) -> Non
     """Refuse an empty mask, warn of one that is elsewhere than its box."""
     if not area(mask, 0):
         refuse(get(at, "segmentation"), "a mask with pixels", "an empty mask")
-    tight = tight_box(decode(mask, 0))
-    low, high = torch.maximum(box[:2], tight[:2]), torch.minimum(box[2:], tight[2:])
-    common = (high - low).clamp_min(0).prod()
-    union = (box[2:] - box[:2]).prod() + (tight[2:] - tight[:2]).prod() - common
-    if common < LEAST_OVERLAP * union:
+    if iou2d(box, tight_box(decode(mask, 0))) < LEAST_OVERLAP:
         warn(f"{at.place} has a box and a mask in different places")
 
 

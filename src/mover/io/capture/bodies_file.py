@@ -62,8 +62,8 @@ def bodies_of(at: At, warn: Warn) -> Bodies:
     """The bodies of named arrays: meshes where they are given, else the posed model."""
     if is_amass(at):
         raise InputError(f"{at.file}: is {AMASS}; expected bodies.npz")
-    frame = _indices(get(at, "frame"), "B")
-    person = _indices(get(at, "person"), len(frame))
+    frame = indices(get(at, "frame"), "B")
+    person = indices(get(at, "person"), len(frame))
     _check_rows(at, frame, person)
     pose = pose_of(at, len(frame))
     given = maybe(at, "vertices")
@@ -78,9 +78,9 @@ def bodies_of(at: At, warn: Warn) -> Bodies:
         joints, names = _joints(at, len(frame))
     space = get(at, "space")
     word: Any = choice(At(str(array(space, (), "text")), at.file, space.field), ("camera", "world"))
-    spread = _scalar(at, "size_spread", 0.0, 1.0)
+    spread = scalar(at, "size_spread", 0.0, 1.0)
     mean_shape = pose is not None and has_mean_shape(pose)  # before a pose is dropped unchecked
-    fps = _scalar(at, "fps", SLOWEST, FASTEST)
+    fps = scalar(at, "fps", SLOWEST, FASTEST)
     reason = reproduces(pose, verts, at) if given is not None and pose is not None else None
     if reason is not None:
         warn(f"{at.file}: {reason}; the bodies can only be refined rigidly")
@@ -115,7 +115,7 @@ def odd_bodies(bodies: Bodies) -> list[str]:
     return found
 
 
-def _indices(at: At, count: int | str) -> Int[Tensor, " rows"]:
+def indices(at: At, count: int | str) -> Int[Tensor, " rows"]:
     """Frames or tracks."""
     value = array(at, (count,), "whole")
     bad = (value < 0) | (value > LAST_INDEX)
@@ -161,7 +161,7 @@ def _joints(at: At, rows: int) -> tuple[Float[Tensor, "bodies joints 3"] | None,
     return joints, tuple(str(word) for word in words)
 
 
-def _scalar(at: At, name: str, least: float, most: float) -> float | None:
+def scalar(at: At, name: str, least: float, most: float) -> float | None:
     """A number that may be missing."""
     given = maybe(at, name)
     if given is None:
@@ -228,9 +228,8 @@ def read_contacts(source: Path, bodies: Bodies, first: int = 0) -> Float[Tensor,
             found = f"has no file for frame {missing[0]}"
             raise InputError(f"{source}: {found}, expected an .npy or .npz")
         if len(set(frames)) < len(frames):
-            raise InputError(
-                f"{source}: one file a frame, but the bodies have several people a frame"
-            )
+            found = "one file a frame, but the bodies have several people a frame"
+            raise InputError(f"{source}: {found}")
         value = np.concatenate([_array(by_frame[k]).reshape(1, -1) for k in frames])
     else:
         value = _array(source)
@@ -248,12 +247,9 @@ def read_contacts(source: Path, bodies: Bodies, first: int = 0) -> Float[Tensor,
 
 def _array(path: Path) -> np.ndarray:
     """The contacts of a file, as numbers."""
-    if path.suffix == ".npz":
-        at: At = read_npz(path)
-        key = next((k for k in KEYS if k in at.value), None)
-        if key is None:
-            raise InputError(f"{path.name}: has {sorted(at.value)}, expected one of {list(KEYS)}")
-        return np.asarray(at.value[key])
-    if not path.is_file():
-        raise InputError(f"{path}: there is no such file, expected an .npy or .npz file")
-    return np.asarray(read_npy(path).value)
+    if path.suffix != ".npz":
+        return np.asarray(read_npy(path).value)
+    at = read_npz(path)
+    if (given := maybe(at, *KEYS)) is None:
+        raise InputError(f"{path.name}: has {sorted(at.value)}, expected one of {list(KEYS)}")
+    return np.asarray(given.value)

@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
+from jaxtyping import Float
 from msgspec import Meta, Struct, to_builtins
+from torch import Tensor
 
 from mover.core.errors import InputError
 from mover.core.types import Capture, Scene, SceneObject
@@ -119,20 +121,25 @@ def joined(edits: Sequence[Edit], new: Edit) -> tuple[Edit, ...]:
 
 
 def _placed(one: SceneObject, at: Placement, scene: Scene) -> SceneObject:
-    """The object where an edit puts it, carried from the edit's world to that of the scene.
-
-    Its box keeps its centre in the camera frame. Its front is the level direction that `recast`
-    turns back into the edit's: a pinned object returns exactly when a run finds that camera.
-    """
+    """The object where an edit puts it, carried from the edit's world to that of the scene."""
     t, yaw, scale = (torch.tensor(x).float() for x in (at.translation, at.yaw, at.scale))
     put = replace(one, t_world_object=t, yaw=yaw, scale=scale, segments=())
-    old, new = tilted(torch.tensor(at.pitch), torch.tensor(at.roll)), scene.camera.R_cam_world
-    center = to_world(to_camera(box_of(put).center, old), new)
-    front = old @ torch.stack([yaw.sin(), torch.zeros_like(yaw), yaw.cos()])
+    old = tilted(torch.tensor(at.pitch), torch.tensor(at.roll))
+    return carried(put, old, scene.camera.R_cam_world)
+
+
+def carried(one: SceneObject, old: Float[Tensor, "3 3"], new: Float[Tensor, "3 3"]) -> SceneObject:
+    """The object in the world that another tilt of the camera (R_cam_world) gives.
+
+    Its box keeps its centre in the camera frame. Its front is the level direction that `recast`
+    turns back into the old one: a pinned object returns exactly when a run finds that camera.
+    """
+    center = to_world(to_camera(box_of(one).center, old), new)
+    front = old @ torch.stack([one.yaw.sin(), torch.zeros_like(one.yaw), one.yaw.cos()])
     up_old, up_new = old[:, 1], new[:, 1]
     level = to_world(front - up_old * (front @ up_new) / (up_old @ up_new), new)
-    turned = replace(put, yaw=torch.atan2(level[0], level[2]))
-    return replace(turned, t_world_object=put.t_world_object + center - box_of(turned).center)
+    turned = replace(one, yaw=torch.atan2(level[0], level[2]))
+    return replace(turned, t_world_object=one.t_world_object + center - box_of(turned).center)
 
 
 def read_edits(path: Path) -> tuple[Edit, ...]:

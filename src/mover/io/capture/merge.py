@@ -8,18 +8,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from mover.core.errors import InputError
 from mover.core.records import fingerprint, rows_of
-from mover.core.types import Bodies, Camera, Capture, Scene, SceneObject
-from mover.geometry.boxes import box_of
-from mover.geometry.camera import to_camera, to_world
-from mover.geometry.rotations import rot_y
+from mover.core.types import Bodies, Camera, Capture, Scene
 from mover.io.capture.annotations_file import detections_of, people_of
 from mover.io.capture.bodies_file import bodies_of, bodies_to_arrays, write_bodies
 from mover.io.capture.build import build_capture
 from mover.io.capture.camera_file import camera_of, turned
+from mover.io.capture.edits import carried
 from mover.io.capture.folder import REFERENCE, folder_parts, read_capture, write_trees
 from mover.io.capture.pairing import linked, named_rows, pair_rows
 from mover.io.capture.parts import UNKNOWN, Parts
@@ -151,8 +150,7 @@ def _united(first: Bodies, second: Bodies, same: set[int], file: str) -> Bodies:
         )
     whole = joined_bodies([rows_of(first, kept), second])
     whole = replace(whole, fps=first.fps if second.fps is None else second.fps)
-    order = torch.argsort(whole.person, stable=True)
-    return rows_of(whole, order[torch.argsort(whole.frame[order], stable=True)])
+    return rows_of(whole, torch.from_numpy(np.lexsort((whole.person, whole.frame))))
 
 
 def _objects(old: Parts, new: Parts) -> At | None:
@@ -200,28 +198,13 @@ def _capture(whole: Parts) -> Capture | None:
     capture = build_capture(replace(whole, camera=camera))
     scene = capture.scene
     if whole.tilt is not None:
-        scene = _under(scene, turned(camera_of(whole.camera))[0])
+        old, new = scene.camera.R_cam_world, turned(camera_of(whole.camera))[0].R_cam_world
+        if float((old - new).abs().max()) >= SMALL_TURN:
+            objects = tuple(carried(one, old, new) for one in scene.objects)
+            scene = Scene(replace(scene.camera, R_cam_world=new), None, objects)
     links = linked(scene, whole.objects)
     objects = (replace(p, annotation=links.get(p.id, p.annotation)) for p in scene.objects)
     return replace(capture, scene=replace(scene, objects=tuple(objects)))
-
-
-def _under(scene: Scene, camera: Camera) -> Scene:
-    """The scene under a new tilt: box centres keep their position in the camera's frame."""
-    old, new = scene.camera.R_cam_world.double(), camera.R_cam_world.double()
-    if float((old - new).abs().max()) < SMALL_TURN:
-        return scene
-    pieces: list[SceneObject] = []
-    for piece in scene.objects:
-        yaw = piece.yaw.double()
-        front = torch.stack([yaw.sin(), torch.zeros_like(yaw), yaw.cos()])
-        front = to_world(to_camera(front, old), new)
-        turn = torch.atan2(front[0], front[2])
-        centre = box_of(piece).center.double()
-        offset = rot_y(yaw).mT @ (centre - piece.t_world_object.double())
-        t = to_world(to_camera(centre, old), new) - rot_y(turn) @ offset
-        pieces.append(replace(piece, yaw=turn.to(piece.yaw), t_world_object=t.to(piece.scale)))
-    return Scene(replace(scene.camera, R_cam_world=camera.R_cam_world), None, tuple(pieces))
 
 
 def _check_apart(whole: Parts) -> None:

@@ -3,7 +3,7 @@
 import json
 import logging
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -13,9 +13,10 @@ from typing import Annotated, Any, Literal, TypeVar
 import torch
 from msgspec import Meta, Struct
 
-from mover.core.types import Camera, Mesh, Scene, SceneObject, Segment
+from mover.core.types import Camera, Scene, SceneObject, Segment
 from mover.geometry.rotations import rot_y, wrap
 from mover.io.capture.camera_file import camera_of, camera_to_json, check_attitude, turned
+from mover.io.capture.parts import LoadMesh
 from mover.io.files.fields import (
     At,
     Warn,
@@ -39,8 +40,6 @@ LONGEST_ID = 60  # [bytes]
 WORDS = ("ground", "free")
 LOWEST = 30.0  # [m], of a floor below the camera
 P = TypeVar("P", SceneObject, Segment)
-LoadMesh = Callable[[At], tuple[Mesh, str]]
-"""Gives the mesh that a field names, and its file."""
 
 
 def read_scene(path: Path, camera: Camera | None = None, warn: Warn = log.warning) -> Scene:

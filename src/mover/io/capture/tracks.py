@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mover.core.types import Bodies, Camera, People
-from mover.geometry.camera import NEAR, project
+from mover.geometry.boxes import iou2d
+from mover.geometry.camera import NEAR
 from mover.geometry.rle import mask_boxes
+from mover.io.capture.agreement import box_around, in_image
 
 OVERLAP = 0.5  # of a body and a mask of one person, mean of share and union
 CLEAR = 0.3  # by so much the next best pair is worse where there is no uncertainty
@@ -56,11 +58,14 @@ def pair_tracks(bodies: Bodies, people: People, camera: Camera) -> TrackPairs:
     Returns:
         The numbers of the bodies count; those of a mask without a body may change to a free one.
     """
-    ours, theirs = _body_boxes(bodies, camera), mask_boxes(people.masks).double().numpy()
+    verts = bodies.verts[:, :: max(1, bodies.verts.shape[1] // POINTS)]
+    seen = (verts[..., 2] > NEAR).all(1, keepdim=True)  # without area: beside or behind the camera
+    ours = in_image(box_around(verts, camera), camera).where(seen, torch.zeros(()))
+    theirs = mask_boxes(people.masks).double()
     scores, margins = defaultdict[Any, list[float]](list), defaultdict[Any, list[float]](list)
     for frame in sorted({*bodies.frame.tolist()} & {*people.frame.tolist()}):
-        a, b = ((one.frame == frame).nonzero()[:, 0].numpy() for one in (bodies, people))
-        fit = _overlaps(ours[a], theirs[b])
+        a, b = ((one.frame == frame).nonzero()[:, 0] for one in (bodies, people))
+        fit = _overlaps(ours[a].double(), theirs[b])
         for i, j in np.ndindex(fit.shape):
             rival = max([0.0, *np.delete(fit[i], j), *np.delete(fit[:, j], i)])
             pair = int(bodies.person[a[i]]), int(people.person[b[j]])
@@ -102,8 +107,10 @@ def _numbered(groups: Mapping[Track, set[Track]], bodies: Bodies, people: People
 
 
 def paired(bodies: Bodies, people: People, pairs: TrackPairs) -> tuple[Bodies, People]:
-    """Bodies and masks under the numbers of `pair_tracks`."""
-    heights = {str(pairs.masks.get(int(k), int(k))): v for k, v in people.heights.items()}
+    """Bodies and masks under the numbers of `pair_tracks`; heights count masks, then bodies."""
+    masks = {one: pairs.masks.get(one, one) for one in people.person.tolist()}
+    numbers = {**pairs.bodies, **pairs.masks, **masks}
+    heights = {str(numbers.get(int(k), int(k))): v for k, v in people.heights.items()}
     return replace(bodies, person=renumbered(bodies.person, pairs.bodies)), replace(
         people, person=renumbered(people.person, pairs.masks), heights=heights
     )
@@ -114,23 +121,14 @@ def renumbered(person: Int[Tensor, " rows"], numbers: Mapping[int, int]) -> Int[
     return torch.tensor([numbers.get(one, one) for one in person.tolist()], dtype=person.dtype)
 
 
-def _body_boxes(bodies: Bodies, camera: Camera) -> NDArray[np.float64]:
-    """Boxes around the bodies in the image; empty for one outside or behind the camera [px]."""
-    verts = bodies.verts[:, :: max(1, bodies.verts.shape[1] // POINTS)]
-    pixels = project(verts, camera.K) * (verts[..., 2:] > NEAR).all(1, keepdim=True)
-    size = torch.tensor([camera.width, camera.height]).to(pixels)
-    low, high = pixels.amin(1).clamp_min(0), torch.minimum(pixels.amax(1), size)
-    return torch.cat([low, torch.maximum(low, high)], 1).double().numpy()
-
-
-def _overlaps(ours: NDArray[np.float64], theirs: NDArray[np.float64]) -> NDArray[np.float64]:
+def _overlaps(
+    ours: Float[Tensor, "bodies 4"], theirs: Float[Tensor, "masks 4"]
+) -> NDArray[np.float64]:
     """How well each body fits each mask: the share of the mask's box inside, and the union."""
-    low = np.maximum(ours[:, None, :2], theirs[None, :, :2])
-    high = np.minimum(ours[:, None, 2:], theirs[None, :, 2:])
-    common = np.prod(np.clip(high - low, 0, None), axis=2)
-    a, b = (np.prod(box[:, 2:] - box[:, :2], axis=1) for box in (ours, theirs))
-    inside = common / np.maximum(b, 1e-9)
-    return (inside + common / np.maximum(a[:, None] + b - common, 1e-9)) / 2
+    a, b = torch.broadcast_tensors(ours[:, None], theirs[None])
+    shared, (first, second) = iou2d(a, b), ((x[..., 2:] - x[..., :2]).prod(-1) for x in (a, b))
+    common = shared * (first + second) / (1 + shared)
+    return ((common / second.clamp_min(1e-9) + shared) / 2).numpy()
 
 
 # Pieces of one person's track, as trackers leave them behind a pillar or at the image's border.
@@ -247,42 +245,38 @@ def numbers_beside(old: Bodies, new: Bodies) -> tuple[dict[int, int], set[int]]:
     Returns:
         New numbers by old ones, and those that were in the first file in the same frames.
     """
-    places = [_seen_at(one) for one in (old, new)]
+    middles = [one.verts.mean(1) for one in (old, new)]
+    before, seen = (seen_at(middle, old.space) for middle in middles)
     taken, given = ({*one.person.tolist()} for one in (old, new))
     free = unused = 1 + max(taken | given)
-    middles = torch.cat([one.verts.mean(1) for one in (old, new)])
-    later, _ = join_pieces(
-        torch.cat([old.frame, new.frame]), torch.cat([old.person, new.person + free]), middles
-    )
-    rows = {pair: k for k, pair in enumerate(zip(*(x.tolist() for x in (old.frame, old.person)),
-                                                 strict=True))}  # fmt: skip
+    frame, person = torch.cat([old.frame, new.frame]), torch.cat([old.person, new.person + free])
+    later, _ = join_pieces(frame, person, torch.cat(middles))
     numbers, same = dict[int, int](), set[int]()
     for track in sorted(given):
         offs: dict[int, float] = {}
-        own = (new.person == track).nonzero()[:, 0].tolist()
+        own = (new.person == track).nonzero()[:, 0]
         for other in taken:
-            pairs = [(k, row) for k in own
-                     if (row := rows.get((int(new.frame[k]), other))) is not None]  # fmt: skip
-            if pairs:
-                a, b = torch.tensor(pairs).T
-                off = (places[1][a, :-1] - places[0][b, :-1]).norm(dim=1) / places[0][b, -1]
-                offs[other] = float(off.median())
+            theirs = (old.person == other).nonzero()[:, 0]
+            i, j = (new.frame[own][:, None] == old.frame[theirs]).nonzero().T
+            a, b = seen[own[i]], before[theirs[j]]
+            if len(a):
+                offs[other] = float(((a - b)[:, :-1].norm(dim=1) / b[:, -1]).median())
         near = min(offs, key=offs.__getitem__, default=None)
         if near is not None and offs[near] <= ONE_PLACE:
             numbers[track] = near
             same.add(near)
-        elif (before := later.get(track + free)) is not None and before in taken - set(offs):
-            numbers[track] = before
+        elif (first := later.get(track + free)) is not None and first in taken - set(offs):
+            numbers[track] = first
         elif track in taken:
             numbers[track] = unused
             unused += 1
     return numbers, same
 
 
-def _seen_at(bodies: Bodies) -> Float[Tensor, "rows axes"]:
+def seen_at(place: Float[Tensor, "rows 3"], space: str = "camera") -> Float[Tensor, "rows axes"]:
     """Where people are, in the image where a camera sees them, and last a person's size there."""
-    place = bodies.verts.double().mean(1)
-    if bodies.space == "world":
+    place = place.double()
+    if space == "world":
         return torch.cat([place, torch.full_like(place[:, :1], TALL)], 1)
     depth = place[:, 2:].clamp_min(NEAR)
     return torch.cat([place[:, :2] / depth, TALL / depth], 1)

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
-from mover.core.files import reason
+from mover.core.files import unreadable
 from mover.geometry.camera import tilted
 from mover.io.files.fields import LARGEST, At, maybe, number, read_json, refuse
 from mover.io.files.schema import Positive, Side, checked
@@ -25,11 +25,11 @@ HALF = 0.5  # [px], calibrations count from the centre of the first pixel
 GUESSED = 0.055  # error of a focal length's logarithm by a network: 3-8 % (GeoCalib, WildCamera)
 WIDEST = 175.0  # [degrees], of a pinhole camera
 STRAIGHT = 2.0  # [px], a lens that moves the corners by less is left as it is
-MATRICES = (
-    "Intrinsics", "camera_matrix", "Camera_Matrix", "cameraMatrix", "intrinsic_matrix",
-    "intrinsics", "mtx", "K",
+MATRIX = (
+    "camera_mtx", "Intrinsics", "camera_matrix", "Camera_Matrix", "cameraMatrix",
+    "intrinsic_matrix", "intrinsics", "mtx", "K",
 )  # fmt: skip
-"""Names of [fx 0 cx; 0 fy cy; 0 0 1] in files of OpenCV, ROS and Open3D, or of fx fy cx cy."""
+"""Names of [fx 0 cx; 0 fy cy; 0 0 1] in files of PROX, OpenCV, ROS and Open3D, or of four."""
 BENT = (
     "Distortion", "distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs",
     "dist_coeff", "dist", "coeffs",
@@ -39,22 +39,26 @@ SIDES = (
     ("w", "width", "image_width", "image_Width"),
     ("h", "height", "image_height", "image_Height"),
 )
+FOUR = (("fx",), ("fy",), ("ppx", "cx"), ("ppy", "cy"))
+"""Names of the four numbers of a lens where they stand by themselves, as RealSense has them."""
+FOCAL = ("focal_length", "f", "focal")
 COLMAP = {
     "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8,
     "OPENCV_FISHEYE": 8, "FULL_OPENCV": 12, "FOV": 5, "SIMPLE_RADIAL_FISHEYE": 4,
     "RADIAL_FISHEYE": 5, "THIN_PRISM_FISHEYE": 12,
 }  # fmt: skip
 """COLMAP's models in the order of their numbers, and how many numbers each has."""
+ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 XML = (
     r"<(?P<a>\w+)[^<>]*>\s*(<(?!data)\w+>[^<]*</\w+>\s*){0,9}<data>(?P<data>[^<]*)"
     r"|<(?P<b>\w+)>(?P<one>[^<]+)</"
 )
 YAML = r"^(?P<a>\w+):((?!^\w).)*?data:\s*\[(?P<data>[^]]*)|^(?P<b>\w+):\s*\[?(?P<one>[^][\n]+)"
 """Matrices with `data`, and numbers by themselves."""
-ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+Size = tuple[int, int] | None
 
 
-def read_camera_file(path: Path, size: tuple[int, int] | None) -> At:
+def read_camera_file(path: Path, size: Size) -> At:
     """The camera of a file of any known kind, in the fields of camera.json.
 
     Known are our own and nerfstudio's .json, 3 x 3 numbers in a text file (cam_K.txt), COLMAP's
@@ -80,34 +84,31 @@ def read_camera_file(path: Path, size: tuple[int, int] | None) -> At:
             return camera_of_tree(read_json(path), size)
         case ".xml" | ".yml" | ".yaml":
             tree = _of_text(path)
-            given = _named(tree, MATRICES)
-            if given is None:
-                refuse(tree, f"a matrix of the camera ({', '.join(MATRICES)})", "none")
-            return _of_matrix(tree, given, size)
+            if maybe(tree, *MATRIX) is None:
+                refuse(tree, f"a matrix of the camera ({', '.join(MATRIX)})", "none")
+            return camera_of_tree(tree, size)
         case _:
-            rows = colmap_rows(path)
-            if rows:
+            if rows := _colmap_rows(path):
                 return _of_colmap(rows, path.name)
-            return with_intrinsics(read_intrinsics(path), size, At(None, path.name), shift=0.0)
+            return _of_matrix(read_intrinsics(path), size, At({}, path.name), shift=0.0)
 
 
-def camera_of_tree(at: At, size: tuple[int, int] | None) -> At:
-    """The fields of camera.json from a JSON object of any known kind."""
+def camera_of_tree(at: At, size: Size) -> At:
+    """The fields of camera.json from a mapping of any known kind."""
     if maybe(at, "fl_x") is not None:
         return At({"w": size[0], "h": size[1], **at.value} if size else at.value, at.file)
-    if (mtx := maybe(at, "camera_mtx")) is not None:
-        return with_intrinsics(_checked(_numbers(mtx), mtx), size, mtx, shift=HALF)
-    if (given := _named(at, MATRICES)) is not None:
-        return _of_matrix(at, given, size)
+    if (given := maybe(at, *MATRIX)) is not None:
+        return _of_matrix(_checked(_numbers(given), given), size, at)
     found = [(way, one) for way, one in _objects(at) if {"fx", "fy"} <= one.value.keys()]
-    if found:  # of several, the colour camera's
-        one = next((one for way, one in found if re.search("colou?r|rgb", way, re.I)), found[0][1])
-        middle = [_named(one, (f"pp{axis}", f"c{axis}")) for axis in "xy"]
-        four = [maybe(one, "fx"), maybe(one, "fy"), *middle]
-        if None in four:
-            refuse(one, "a lens with fx, fy, ppx, ppy or cx, cy")
-        return _of_matrix(one, At([n.value for n in four if n], one.file, one.field), size)
-    return _of_lens(at, size)
+    if not found:
+        return _of_lens(at, size)
+    # Of several, the colour camera's.
+    one = next((one for way, one in found if re.search("colou?r|rgb", way, re.I)), found[0][1])
+    four = [maybe(one, *names) for names in FOUR]
+    if None in four:
+        refuse(one, "a lens with fx, fy, ppx, ppy or cx, cy")
+    lens = At([n.value for n in four if n], one.file, one.field)
+    return _of_matrix(_checked(_numbers(lens), lens), size, one)
 
 
 def _objects(at: At, way: str = "", depth: int = 3) -> Iterator[tuple[str, At]]:
@@ -118,11 +119,6 @@ def _objects(at: At, way: str = "", depth: int = 3) -> Iterator[tuple[str, At]]:
             yield from _objects(At(at.value[key], at.file, str(key)), f"{way} {key}", depth - 1)
 
 
-def _named(at: At, names: tuple[str, ...]) -> At | None:
-    """The first of these fields that is there."""
-    return next((found for name in names if (found := maybe(at, name)) is not None), None)
-
-
 def _numbers(at: At) -> NDArray[np.float64]:
     """The numbers of lists in lists, or of OpenCV's {"data": [...]}, one after another."""
     value: Any = at.value.get("data") if isinstance(at.value, Mapping) else at.value
@@ -130,30 +126,33 @@ def _numbers(at: At) -> NDArray[np.float64]:
     return np.array([number(At(one, at.file, at.field)) for one in flat])
 
 
-def _of_matrix(at: At, given: At, size: tuple[int, int] | None) -> At:
-    """A camera from its matrix, and the size and the distortion beside it."""
-    sides = [_named(at, names) for names in SIDES]
+def _of_matrix(K: NDArray[np.float64], size: Size, at: At, shift: float = HALF) -> At:
+    """A camera from its matrix, and the size, the distortion and the pose beside it.
+
+    Args:
+        K: Intrinsics, whose principal point lacks a `shift` [px].
+        size: Width and height of the image, before those that the file gives [px].
+        at: The mapping in which the matrix stands.
+        shift: Of the centre of the first pixel [px].
+    """
+    sides = [maybe(at, *names) for names in SIDES]
     if size is None and None not in sides:
         w, h = (checked(At(int(_numbers(s)[0]), s.file, s.field), Side) for s in sides if s)
         size = w, h
-    K = _checked(_numbers(given), given)
-    bent = _named(at, BENT)
-    if bent is not None:
+    if (bent := maybe(at, *BENT)) is not None:
         _check_straight(_numbers(bent), K, size, bent)
-    found = with_intrinsics(K, size, given, shift=HALF)
-    seen = maybe(at, "CameraMatrix")
-    if seen is not None:  # of the authors of MOVER: [R | t] of a world that is y-down
-        R = _numbers(seen)
-        if R.size != 12:
-            refuse(seen, "3 x 4 numbers", f"{R.size}")
-        turn = (R.reshape(3, 4)[:, :3] @ np.diag([1.0, -1.0, -1.0])).tolist()
-        found = At({**found.value, "R_cam_world": turn}, found.file)
-    return found
+    fx, fy, cx, cy = (K[i, j].item() for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    found = _lens(at, size, fx, fy, (cx + shift, cy + shift))
+    if (seen := maybe(at, "CameraMatrix")) is None:
+        return found
+    R = _numbers(seen)  # of the authors of MOVER: [R | t] of a world that is y-down
+    if R.size != 12:
+        refuse(seen, "3 x 4 numbers", f"{R.size}")
+    turn = (R.reshape(3, 4)[:, :3] @ np.diag([1.0, -1.0, -1.0])).tolist()
+    return At({**found.value, "R_cam_world": turn}, found.file)
 
 
-def _check_straight(
-    bent: NDArray[np.float64], K: NDArray[np.float64], size: tuple[int, int] | None, at: At
-) -> None:
+def _check_straight(bent: NDArray[np.float64], K: NDArray[np.float64], size: Size, at: At) -> None:
     """Refuse a lens that moves the corners of the image by more than `STRAIGHT`."""
     if not bent.any():
         return
@@ -167,20 +166,19 @@ def _check_straight(
     log.warning("%s: its distortion (%.2g px at the corners) is left out", at.file, moved * K[0, 0])
 
 
-def with_intrinsics(
-    K: NDArray[np.float64], size: tuple[int, int] | None, at: At, *, shift: float
+def _lens(
+    at: At, size: Size, fx: float, fy: float, centre: tuple[float, float] | None = None
 ) -> At:
-    """The fields of camera.json of a matrix whose principal point lacks a `shift` [px]."""
-    w, h = _known(size, at)
-    cx, cy = K[0, 2].item() + shift, K[1, 2].item() + shift
-    return At({"w": w, "h": h, "fl_x": K[0, 0].item(), "fl_y": K[1, 1].item(), "cx": cx, "cy": cy},
-              at.file)  # fmt: skip
+    """The fields of camera.json; without a centre, the principal point is the image's middle."""
+    if size is None:
+        refuse(at, "the size of the image beside it: give --image", "no width and height")
+    (w, h), (cx, cy) = size, centre or (size[0] / 2, size[1] / 2)
+    return At({"w": w, "h": h, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}, at.file)
 
 
 def of_view(degrees: float, size: tuple[int, int], file: str) -> At:
     """The camera with this horizontal field of view and the principal point in the middle."""
-    focal = _focal(At(degrees, file), size[0])
-    return _centred(focal, focal, size, file)
+    return _of_lens(At({"fov_x": degrees}, file), size)
 
 
 def with_spread(at: At, spread: float) -> At:
@@ -195,24 +193,13 @@ def guessed_view(degrees: float, size: tuple[int, int]) -> At:
 
 def read_intrinsics(path: Path) -> NDArray[np.float64]:
     """The 3 x 3 numbers of a text file [fx 0 cx; 0 fy cy; 0 0 1]."""
-    words = [word for line in _text(path).splitlines() for word in _words(line)]
+    words = [word for row in _rows(path) for word in row]
     try:
         numbers = np.array([float(word) for word in words])
     except ValueError as error:
-        expected = "3 x 3 numbers, or COLMAP's cameras.txt"
-        why = reason(ValueError(f"it is text, {' '.join(words)[:40]!r}"), path)
-        raise InputError(f"{path.name}: cannot be read ({why}), expected {expected}") from error
+        why = f"it is text, {' '.join(words)[:40]!r}"
+        raise unreadable(path, why, "3 x 3 numbers, or COLMAP's cameras.txt") from error
     return _checked(numbers, At(numbers.tolist(), path.name))
-
-
-def _words(line: str) -> list[str]:
-    """The words of a line without its comment."""
-    return line.partition("#")[0].replace(",", " ").split()
-
-
-def tilt_of(pitch: float, roll: float) -> list[list[float]]:
-    """R_cam_world of angles [rad]: diag(1, -1, -1) R_z(roll) R_x(-pitch)."""
-    return tilted(*torch.tensor([pitch, roll], dtype=torch.float64)).tolist()
 
 
 def _checked(values: NDArray[np.float64], at: At) -> NDArray[np.float64]:
@@ -229,40 +216,24 @@ def _checked(values: NDArray[np.float64], at: At) -> NDArray[np.float64]:
     return K
 
 
-def _known(size: tuple[int, int] | None, at: At) -> tuple[int, int]:
-    if size is None:
-        refuse(at, "the size of the image beside it: give --image", "no width and height")
-    return size
-
-
-def _of_lens(at: At, size: tuple[int, int] | None) -> At:
+def _of_lens(at: At, size: Size) -> At:
     """A camera from a focal length or a field of view, with its tilt where the file has it."""
+    pitch, roll = maybe(at, "pitch"), maybe(at, "roll")
+    focal, across, up = maybe(at, *FOCAL), maybe(at, "fov_x"), maybe(at, "fov_y")
     tilt: dict[str, Any] = {}
-    if (pitch := maybe(at, "pitch")) is not None and (roll := maybe(at, "roll")) is not None:
-        tilt["R_cam_world"] = tilt_of(number(pitch, -1.6, 1.6), number(roll, -1.6, 1.6))
-    focal = _named(at, ("focal_length", "f", "focal"))
-    across, up = maybe(at, "fov_x"), maybe(at, "fov_y")
-    if focal is None and across is None:
-        known = f"fl_x, fx, camera_mtx, {', '.join(MATRICES)}, focal_length, f or fov_x"
+    if pitch is not None and roll is not None:  # diag(1, -1, -1) R_z(roll) R_x(-pitch)
+        angles = [number(pitch, -1.6, 1.6), number(roll, -1.6, 1.6)]
+        tilt["R_cam_world"] = tilted(*torch.tensor(angles, dtype=torch.float64)).tolist()
+    fx = 0.0 if focal is None else checked(focal, Positive)
+    lens = _lens(at, size, fx, fx).value if focal or across else {}
+    if across is not None and focal is None:
+        views = ("fl_x", "w", across), ("fl_y", "h", up) if up else ("fl_y", "w", across)
+        for name, side, view in views:
+            lens[name] = lens[side] / 2 / math.tan(math.radians(number(view, 1, WIDEST)) / 2)
+    elif focal is None:
+        known = f"fl_x, fx, {', '.join(MATRIX)}, {', '.join(FOCAL[:2])} or fov_x"
         refuse(at, f"a camera with one of the fields {known}")
-    size = _known(size, at)
-    if focal is not None:
-        fx = fy = checked(focal, Positive)
-    else:
-        assert across is not None
-        fx = _focal(across, size[0])
-        fy = fx if up is None else _focal(up, size[1])
-    return At({**_centred(fx, fy, size, at.file).value, **tilt}, at.file)
-
-
-def _focal(at: At, side: int) -> float:
-    """The focal length of an angle of view [degrees] along a side [px]."""
-    return side / 2 / math.tan(math.radians(number(at, 1, WIDEST)) / 2)
-
-
-def _centred(fx: float, fy: float, size: tuple[int, int], file: str) -> At:
-    w, h = size
-    return At({"w": w, "h": h, "fl_x": fx, "fl_y": fy, "cx": w / 2, "cy": h / 2}, file)
+    return At({**lens, **tilt}, at.file)
 
 
 # Texts of OpenCV's FileStorage, of ROS and of COLMAP.
@@ -275,8 +246,13 @@ def _text(path: Path) -> str:
             raise ValueError("it is too large for a calibration")
         return path.read_text(encoding="utf-8-sig")
     except (OSError, ValueError) as error:
-        why = reason(error, path)
-        raise InputError(f"{path.name}: cannot be read ({why}), expected a camera") from error
+        raise unreadable(path, error, "a camera") from error
+
+
+def _rows(path: Path) -> list[list[str]]:
+    """The words of the lines that are no comments."""
+    lines = (line.partition("#")[0] for line in _text(path).splitlines())
+    return [words for line in lines if (words := line.replace(",", " ").split())]
 
 
 def _of_text(path: Path) -> At:
@@ -290,18 +266,17 @@ def _of_text(path: Path) -> At:
         try:
             found[name] = [float(word) for word in words]
         except ValueError:
-            if name in (*MATRICES, *BENT):
+            if name in (*MATRIX, *BENT):
                 refuse(At(" ".join(words), path.name, name), "numbers")
     if not found:
-        why = reason(ValueError("it has no numbers with names"), path)
-        raise InputError(f"{path.name}: cannot be read ({why}), expected OpenCV's calibration")
+        raise unreadable(path, "it has no numbers with names", "OpenCV's calibration")
     return At(found, path.name)
 
 
-def colmap_rows(path: Path) -> list[list[str]]:
+def _colmap_rows(path: Path) -> list[list[str]]:
     """Rows CAMERA_ID MODEL WIDTH HEIGHT PARAMS of COLMAP's cameras.txt or .bin; none of others."""
     if path.suffix.lower() != ".bin":
-        rows = [words for line in _text(path).splitlines() if (words := _words(line))]
+        rows = _rows(path)
         return rows if all(len(row) > 4 and row[1] in COLMAP for row in rows) else []
     models, found = list(COLMAP), list[list[str]]()
     try:
@@ -314,8 +289,7 @@ def colmap_rows(path: Path) -> list[list[str]]:
             found.append([str(v) for v in (camera, models[model], w, h, *values)])
             place += 24 + 8 * size
     except (OSError, struct.error, IndexError) as error:
-        why = reason(error, path)
-        raise InputError(f"{path.name}: cannot be read ({why}), expected cameras.bin") from error
+        raise unreadable(path, error, "cameras.bin") from error
     return found
 
 
@@ -334,10 +308,8 @@ def _of_colmap(rows: list[list[str]], file: str) -> At:
     if len(values) != COLMAP[model]:
         refuse(at, f"{COLMAP[model]} numbers", f"{len(values)}")
     if "FISHEYE" in model or model == "FOV":
-        refuse(
-            at, "a straight lens: undistort the images (colmap image_undistorter)", "a fisheye's"
-        )
+        cure = "a straight lens: undistort the images (colmap image_undistorter)"
+        refuse(at, cure, "a fisheye's")
     fx, fy, cx, cy, *bent = values[:1] * (model in ONE_FOCAL) + values
     K, size = _checked(np.array([fx, fy, cx, cy]), at), (int(w), int(h))
-    _check_straight(np.array(bent), K, size, at)
-    return with_intrinsics(K, size, at, shift=0.0)
+    return _of_matrix(K, size, At({"coeffs": bent}, file, model), shift=0.0)

@@ -74,10 +74,10 @@ def get(at: At, key: str) -> At:
     return At(value, at.file, f"{at.field}.{key}" if at.field else key)
 
 
-def maybe(at: At, key: str) -> At | None:
-    """The field `key`, or None where it is missing or null."""
-    found = get(at, key)
-    return None if found.value is MISSING or found.value is None else found
+def maybe(at: At, *keys: str) -> At | None:
+    """The first of several names of a field that is there and not null, None without."""
+    given = mapping(at)
+    return next((get(at, key) for key in keys if given.get(key) is not None), None)
 
 
 def mapping(at: At) -> Mapping[str, Any]:
@@ -165,14 +165,19 @@ def array(
 _KINDS = {"real": "fiu", "whole": "iu", "text": "U"}
 
 
+def existing(path: Path, expected: str = "") -> Path:
+    """The path of a file that is there and not too large."""
+    name, more = path.name or path.resolve().name, f", expected {expected}" if expected else ""
+    if not path.is_file():
+        raise InputError(f"{name}: there is no such file in {path.parent}{more}")
+    if (size := path.stat().st_size) > LARGEST_FILE:
+        raise InputError(f"{name}: has {size} bytes, expected at most {LARGEST_FILE}")
+    return path
+
+
 def read_json(path: Path) -> At:
     """The content of a JSON file."""
-    name = path.name
-    if not path.is_file():
-        raise InputError(f"{name}: there is no such file in {path.parent}, expected a JSON file")
-    if path.stat().st_size > LARGEST_FILE:
-        size = path.stat().st_size
-        raise InputError(f"{name}: has {size} bytes, expected at most {LARGEST_FILE}")
+    name = existing(path, "a JSON file").name
     try:
         text = path.read_text(encoding="utf-8-sig")
         return At(json.loads(text, object_pairs_hook=_once), name)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mover.core.errors import InputError
-from mover.core.files import reason, replacing
+from mover.core.files import reason, replacing, unreadable
 from mover.core.types import Camera, DepthImage
 from mover.io.files.fields import At, array, maybe, refuse
 from mover.io.files.meshes import inside
@@ -49,8 +49,7 @@ def opened(
     ) as error:  # fmt: skip
         if at is not None:
             refuse(at, expected, f"{str(at.value)!r}, which cannot be read ({reason(error, path)})")
-        said = f"cannot be read ({reason(error, path)}), expected {expected}"
-        raise InputError(f"{path.name}: {said}") from error
+        raise unreadable(path, error, expected) from error
 
 
 def read_image(at: At, folder: Path, camera: Camera) -> Float[Tensor, "h w 3"]:

@@ -11,9 +11,9 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
-from mover.core.files import reason, replacing
+from mover.core.files import replacing, unreadable
 from mover.core.records import BROKEN
-from mover.io.files.fields import LARGEST_FILE, At, mapping
+from mover.io.files.fields import LARGEST_FILE, At, existing, mapping
 
 
 class NotPlain:
@@ -41,17 +41,13 @@ def read_npz(path: Path) -> At:
     Raises:
         InputError: If it is missing, broken or too large.
     """
-    name = path.name or path.resolve().name
-    if not path.is_file():
-        raise InputError(f"{name}: there is no such file in {path.parent}, expected an .npz file")
+    name = existing(path, "an .npz file").name or path.resolve().name
     try:
         odd = _odd_arrays(path)
         with np.load(path, allow_pickle=False) as arrays:
             return At({key: odd.get(key) or arrays[key] for key in arrays.files}, name)
     except BROKEN as error:
-        raise InputError(
-            f"{name}: cannot be read ({reason(error, path)}), expected an .npz file"
-        ) from error
+        raise unreadable(path, error, "an .npz file") from error
 
 
 def _odd_arrays(path: Path) -> dict[str, NotPlain]:
@@ -102,9 +98,7 @@ def read_npy(path: Path) -> At:
             file.seek(0)
             return At(np.load(file, allow_pickle=False), path.name)
     except BROKEN as error:
-        raise InputError(
-            f"{path.name}: cannot be read ({reason(error, path)}), expected an .npy file"
-        ) from error
+        raise unreadable(path, error, "an .npy file") from error
 
 
 def write_npz(arrays: Mapping[str, NDArray[Any]], path: Path) -> None:

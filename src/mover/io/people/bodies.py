@@ -3,6 +3,7 @@
 import dataclasses
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -13,7 +14,7 @@ from mover.core.errors import InputError
 from mover.core.records import record
 from mover.core.types import Bodies, BodyPose
 from mover.io.capture.pose_file import NEEDED, run_model
-from mover.io.capture.tracks import TALL, join_pieces, renumbered
+from mover.io.capture.tracks import join_pieces, renumbered, seen_at
 from mover.io.files.fields import LARGEST, At, listed
 from mover.io.files.meshes import read_mesh
 from mover.io.formats import chosen as format_of
@@ -61,10 +62,9 @@ def bodies_from(tool: str, path: Path, known: Known | None = None) -> ImportedBo
         used, true = values["K"].double(), known.camera.K.double()
         shift = refocused(verts.mean(1).double(), used, true)
         if shift is not None:
-            shift = shift.float()
-            verts = verts + shift[:, None]
-            joints = None if joints is None else joints + shift[:, None]
-            pose = None if pose is None else dataclasses.replace(pose, transl=pose.transl + shift)
+            verts = verts + shift[:, None].float()
+            joints = None if joints is None else joints + shift[:, None].float()
+            pose = pose and dataclasses.replace(pose, transl=pose.transl + shift.float())
     if not (verts.abs() <= LARGEST).all():
         raise InputError(f"{file}: has bodies at positions that are not finite under this lens")
     bodies = Bodies(
@@ -103,15 +103,11 @@ def _sound(found: Found, file: str, warnings: list[str]) -> Found:
 
 def _tracked(found: Found, known: Known, file: str, warnings: list[str]) -> Found:
     """With one track for each person: of people in pieces, and of those whom no tool follows."""
-    values, person = found.values, found.values["person"]
-    frame, place = (
-        values["frame"],
-        values["verts"].mean(1) if "verts" in values else values["transl"],
-    )
+    values, person, frame = found.values, found.values["person"], found.values["frame"]
+    place = values["verts"].mean(1) if "verts" in values else values["transl"]
     if (person == UNTRACKED).all() and len(frame.unique()) < len(frame):
-        size = TALL / place[:, 2:].double().clamp_min(0.1)  # in the image, as depths are uncertain
-        at = torch.cat([place[:, :2].double() / place[:, 2:].double().clamp_min(0.1), size], 1)
-        person = torch.from_numpy(followed(frame.tolist(), at.numpy(), size[:, 0].numpy()))
+        at = seen_at(place, found.space).numpy()
+        person = torch.from_numpy(followed(frame.tolist(), at, at[:, -1]))
         warnings.append(f"{file}: has no tracks, so people are followed by their positions")
     person = renumbered(person.clamp_min(0), known.tracks)
     if found.space == "camera":
@@ -124,8 +120,7 @@ def _tracked(found: Found, known: Known, file: str, warnings: list[str]) -> Foun
 def _in_order(found: Found, file: str) -> Found:
     """Sorted by frame, then by person, who may be in a frame once."""
     frame, person = found.values["frame"], found.values["person"]
-    order = torch.argsort(person, stable=True)
-    order = order[torch.argsort(frame[order], stable=True)]
+    order = torch.from_numpy(np.lexsort((person, frame)))
     pairs = torch.stack([frame, person], 1)[order]
     twice = (pairs[1:] == pairs[:-1]).all(1)
     if twice.any():

@@ -17,8 +17,11 @@ from numpy.typing import NDArray
 from mover.bodies.keypoints import LAYOUTS as JOINTS
 from mover.core.errors import InputError
 from mover.core.types import Keypoints
+from mover.io.capture.bodies_file import indices, scalar
 from mover.io.files.fields import (
+    FASTEST,
     LARGEST,
+    SLOWEST,
     At,
     array,
     choice,
@@ -32,7 +35,7 @@ from mover.io.files.fields import (
 from mover.io.files.npz import read_npz, write_npz
 from mover.io.formats import chosen
 from mover.io.people.found import Known, followed
-from mover.io.people.values import either, files_of, named, need, number_in, numbers, tensor
+from mover.io.people.values import files_of, named, need, number_in, numbers, tensor
 
 _NAMES = ("openpose25", "openpose137", "coco17", "halpe26", "mediapipe33")
 LAYOUTS = {name: len(JOINTS[name]) for name in _NAMES}
@@ -107,11 +110,11 @@ def read_instances(path: Path, known: Known, layout: str) -> Keypoints:
     at = read_json(path)
     if not isinstance(at.value, dict | list):
         refuse(at, "a list of instances, or an object with 'annotations' or 'instance_info'")
-    images = None if isinstance(at.value, list) else either(at, "instance_info")
+    images = None if isinstance(at.value, list) else maybe(at, "instance_info")
     if images is not None:
         listed: list[tuple[At, int]] = []
         for index, image in enumerate(items(images)):
-            number = either(image, "frame_id", "image_id")
+            number = maybe(image, "frame_id", "image_id")
             frame = index if number is None else _integer(number)
             listed += [(one, frame) for one in items(need(image, "instances"))]
     else:
@@ -134,7 +137,7 @@ def _integer(at: At) -> int:
 
 def _instance(at: At, frame: int, count: int) -> PersonJoints:
     """One person of a list; a track that is no number from 0 is unknown."""
-    given, scores = need(at, "keypoints"), either(at, "keypoint_scores", "scores")
+    given, scores = need(at, "keypoints"), maybe(at, "keypoint_scores", "scores")
     value = numbers(given)
     width = value.size // count if value.size % count == 0 else 0
     if width not in (2, 3) or (value.ndim > 1 and value.shape[-1] != width):
@@ -147,7 +150,7 @@ def _instance(at: At, frame: int, count: int) -> PersonJoints:
         joints = np.concatenate([joints, sure.reshape(count, 1)], 1)
     if "num_keypoints" in mapping(at):  # ground truth: 0 absent, 1 hidden, 2 visible
         joints = np.where([True, True, False], joints, joints > 0)
-    found = either(at, "track_id", "idx", "person_id")
+    found = maybe(at, "track_id", "idx", "person_id")
     track: Any = -1 if found is None else found.value
     while isinstance(track, list):
         track = track[0] if len(track) == 1 else -1  # pyright: ignore[reportUnknownVariableType]
@@ -165,18 +168,18 @@ def read_openpose(path: Path, known: Known) -> Keypoints:
         for at in items(need(read_json(file), "people")):
             need(at, "pose_keypoints_2d")
             joints = np.concatenate([_part(at, name, count) for name, count in PARTS.items()])
-            given = either(at, "person_id")
+            given = maybe(at, "person_id")
             ids = [-1.0] if given is None else numbers(given).reshape(-1).tolist() or [-1.0]
             seen.append(PersonJoints(frame, int(ids[0]), joints))
-    more = any(one.joints[25:, 2].any() for one in seen)
-    if not more:
-        seen = [PersonJoints(one.frame, one.person, one.joints[:25]) for one in seen]
-    return keypoints_of(seen, "openpose137" if more else "openpose25", known.fps, path.name)
+    if any(one.joints[25:, 2].any() for one in seen):
+        return keypoints_of(seen, "openpose137", known.fps, path.name)
+    seen = [PersonJoints(one.frame, one.person, one.joints[:25]) for one in seen]
+    return keypoints_of(seen, "openpose25", known.fps, path.name)
 
 
 def _part(at: At, name: str, count: int) -> NDArray[np.float64]:
     """The triples of a part; zeros where it is not given."""
-    given = either(at, name)
+    given = maybe(at, name)
     if given is None or not np.size(numbers(given)):
         return np.zeros((count, 3))
     value = numbers(given)
@@ -207,22 +210,19 @@ def read_keypoints(path: Path) -> Keypoints:
     at = read_npz(path)
     word = get(at, "layout")
     layout = choice(At(str(array(word, (), "text")), at.file, "layout"), tuple(LAYOUTS))
-    frame = array(get(at, "frame"), ("B",), "whole").astype(np.int64)
-    rows = len(frame)
-    person = array(get(at, "person"), (rows,), "whole").astype(np.int64)
-    if not rows or frame.min() < 0 or person.min() < 0:
-        refuse(get(at, "frame"), "rows with frames and tracks from 0")
+    frame = indices(get(at, "frame"), "B")
+    if not (rows := len(frame)):
+        refuse(get(at, "frame"), "at least one row", "no rows")
     points = array(get(at, "points"), (rows, LAYOUTS[layout], 2)).astype(np.float32)
     sure = get(at, "confidence")
     confidence = array(sure, (rows, LAYOUTS[layout])).astype(np.float32)
     if confidence.min() < 0 or confidence.max() > 1:
         refuse(sure, "numbers from 0 to 1", f"{confidence.min():g} to {confidence.max():g}")
-    fps = maybe(at, "fps")
     return Keypoints(
         points=torch.from_numpy(points),
         confidence=torch.from_numpy(confidence),
         layout=layout,
-        frame=torch.from_numpy(frame),
-        person=torch.from_numpy(person),
-        fps=None if fps is None else float(array(fps, ())[()]),
+        frame=frame,
+        person=indices(get(at, "person"), rows),
+        fps=scalar(at, "fps", SLOWEST, FASTEST),
     )

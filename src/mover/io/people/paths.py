@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
-from mover.core.files import reason
+from mover.core.files import reason, unreadable
 from mover.core.records import BROKEN
 from mover.geometry.rotations import affine
-from mover.io.files.fields import At, refuse
+from mover.io.files.fields import At, existing, refuse
 from mover.io.people import values as v
 from mover.io.people.values import need
 
@@ -133,9 +133,9 @@ def read_colmap(path: Path) -> At:
 def _lines(file: Path) -> list[tuple[int, str]]:
     """The lines of a text file without comments, numbered."""
     try:
-        text = v.existing(file).read_text(encoding="utf-8-sig")
+        text = existing(file).read_text(encoding="utf-8-sig")
     except BROKEN as error:
-        raise InputError(f"{file.name}: cannot be read ({reason(error, file)})") from error
+        raise unreadable(file, error, "text") from error
     lines = [line for line in text.splitlines() if not re.match(r"\s*#", line)]
     return [(number, line) for number, line in enumerate(lines) if line.strip()]
 

@@ -22,11 +22,11 @@ from mover.bodies.skinning import FLAT
 from mover.core.errors import InputError
 from mover.core.types import BodyPose
 from mover.io.capture.pose_file import GENDERS, NEEDED, moved
-from mover.io.files.fields import At, get, items, mapping, refuse
+from mover.io.files.fields import At, get, items, mapping, maybe, refuse
 from mover.io.people import values as v
 from mover.io.people.found import UNTRACKED, Found, Known, joined
 from mover.io.people.lens import assumed_lens, from_weak, lens, lens_of, movement, tilting
-from mover.io.people.values import either, need
+from mover.io.people.values import need
 
 Names = tuple[str, ...]
 JOINTS = {"smpl": (24,), "smplh": (52, 22), "smplx": (55, 25, 22)}
@@ -113,10 +113,10 @@ def _rows(tool: Tool, person: Person, known: Known) -> Found:
     count = len(turns)
     if frames is None:
         frames = np.arange(person.frame, person.frame + count)
-    shape = (either if tool.shapeless else need)(at, *tool.shape)
+    shape = (maybe if tool.shapeless else need)(at, *tool.shape)
     betas = np.zeros((count, SHAPES)) if shape is None else v.rows(shape, count, *tool.widths)
-    given, rate = either(at, tool.translation), either(at, *tool.rate)
-    turn, shift = (either(at, name) for name in tool.camera) if tool.camera else (None, None)
+    given, rate = maybe(at, tool.translation), maybe(at, *tool.rate)
+    turn, shift = (maybe(at, name) for name in tool.camera) if tool.camera else (None, None)
     if given is None and shift is None:
         need(at, tool.translation, *tool.camera[1:])
     place = np.zeros((count, 3)) if given is None else v.rows(given, count, 3)
@@ -157,7 +157,7 @@ def _turns(
         turned = _decoded(body, count, known)
     else:
         turned = v.angles(body, count, 23, 21)[:, : 69 if model == "smpl" else 63]
-    extra = {n: v.tensor(v.rows(one, count)) for n in EXTRA if (one := either(at, n)) is not None}
+    extra = {n: v.tensor(v.rows(one, count)) for n in EXTRA if (one := maybe(at, n)) is not None}
     return torch.cat([root, turned], 1), extra
 
 
@@ -176,7 +176,7 @@ def _decoded(at: At, count: int, known: Known) -> Tensor:
 
 
 def _gender(at: At) -> str:
-    given = either(at, "gender")
+    given = maybe(at, "gender")
     if given is None:
         return "neutral"
     value: Any = given.value.tolist() if isinstance(given.value, np.ndarray) else given.value
@@ -201,18 +201,18 @@ def gvhmr(path: Path, _: Known) -> Iterator[Person]:
     """hmr4d_results.pt of GVHMR, smpl_params.pt of GEM: one person in all frames."""
     at = _in_folder(path, "hmr4d_results.pt", "smpl_params.pt")
     body = need(at, "smpl_params_incam", "body_params_incam")
-    world = either(at, "smpl_params_global", "body_params_global")
+    world = maybe(at, "smpl_params_global", "body_params_global")
     warnings: tuple[str, ...] = ()
     if world is not None:
         root = v.angles(need(body, "global_orient"), None, 1)
         warnings = tilting(root, v.angles(need(world, "global_orient"), len(root), 1))
-    yield Person(body, K=either(at, "K_fullimg"), warnings=warnings)
+    yield Person(body, K=maybe(at, "K_fullimg"), warnings=warnings)
 
 
 def wham(path: Path, known: Known) -> Iterator[Person]:
     """wham_output.pkl: people by their tracks."""
     for track, at in v.people_of(_in_folder(path, "wham_output.pkl")):
-        world, warnings = either(at, "pose_world"), ()
+        world, warnings = maybe(at, "pose_world"), ()
         if world is not None:
             root = v.angles(need(at, "pose"), None, 24)[:, :3]
             warnings = tilting(root, v.angles(world, len(root), 24)[:, :3])
@@ -222,7 +222,7 @@ def wham(path: Path, known: Known) -> Iterator[Person]:
 def prompthmr(path: Path, _: Known) -> Iterator[Person]:
     """results.pkl: `people`, and the cameras beside them."""
     source = _in_folder(path, "results.pkl")
-    camera, world = either(source, "camera", "camera_world"), either(source, "camera_world")
+    camera, world = maybe(source, "camera", "camera_world"), maybe(source, "camera_world")
     K, warnings = None if camera is None else _image_lens(camera), ()
     if world is not None:
         R = v.stacked(need(world, "Rcw"), 3, 3)
@@ -240,7 +240,7 @@ def tram(path: Path, _: Known) -> Iterator[Person]:
     lens_of_all, warnings = None, ()
     if file.is_file():
         source = v.read_any(file)
-        lens_of_all, turn = _image_lens(source), either(source, "world_cam_R")
+        lens_of_all, turn = _image_lens(source), maybe(source, "world_cam_R")
         if turn is not None:  # x_world = R x_cam + t
             R = np.swapaxes(v.stacked(turn, 3, 3), 1, 2)
             t = v.rows(need(source, "world_cam_T"), len(R), 3)
@@ -268,7 +268,7 @@ def pare(path: Path, known: Known) -> Iterator[Person]:
     files = videos[:1] or v.files_of(path, "*.pkl", "PARE's results")
     for k, file in enumerate(files):
         at, people = v.read_any(file), list[tuple[int | None, At]]()
-        if either(at, "orig_cam", "pred_pose") is None:  # of a video: people by track
+        if maybe(at, "orig_cam", "pred_pose") is None:  # of a video: people by track
             people += v.people_of(at)
         else:
             count = len(v.rows(need(at, "orig_cam"), None, 4))
@@ -295,7 +295,7 @@ def phalp(path: Path, known: Known) -> Iterator[Person]:
         listed = list(camera.value) if isinstance(camera.value, np.ndarray) else camera.value
         bodies, cameras = items(need(at, "smpl")), items(At(listed, camera.file, camera.field))
         tracks = v.whole(need(at, "tid"))
-        ages, sizes = either(at, "tracked_time"), either(at, "size")
+        ages, sizes = maybe(at, "tracked_time"), maybe(at, "size")
         if not len(bodies) == len(cameras) == len(tracks):
             n = f"{len(tracks)} tracks, {len(bodies)} bodies and {len(cameras)} cameras"
             raise InputError(f"{at.place} has {n}, expected as many of each")
@@ -305,7 +305,7 @@ def phalp(path: Path, known: Known) -> Iterator[Person]:
             height, width = v.stacked(sizes, 2)[0].tolist()
             size = width, height
         K = assumed_lens(known, lambda *sides: FOCAL / CROP * max(sides), size)
-        time = either(at, "time")
+        time = maybe(at, "time")
         frame = index if time is None or v.one_number(time) < 0 else int(v.one_number(time))
         for k in range(len(tracks)):
             if len(age) != len(tracks) or age[k] == 0:
@@ -323,7 +323,7 @@ def slahmr(path: Path, _: Known) -> Iterator[Person]:
     """
     path = v.files_of(path, "**/*_world_results.npz", "SLAHMR's results")[-1]
     source = v.read_any(path)
-    if "prior_results" in path.name and either(source, "trans") is None:
+    if "prior_results" in path.name and maybe(source, "trans") is None:
         raise InputError(
             f"{path.name}: is SLAHMR's motion prior, without positions; expected the file "
             "*_world_results.npz of the same number beside it"
@@ -338,7 +338,7 @@ def slahmr(path: Path, _: Known) -> Iterator[Person]:
         fields[name] = v.numbers(given)
         if fields[name].shape[:2] != (people, count):
             refuse(given, f"({people}, {count}, n) numbers", f"shape {fields[name].shape}")
-    intrins = either(source, "intrins")
+    intrins = maybe(source, "intrins")
     K = None if intrins is None else lens(*v.stacked(intrins, 4)[0].tolist())
     whole = [(who, who, np.arange(count)) for who in range(people)]
     for track, who, frames in [*_visible(path, count, people)] or whole:
@@ -424,8 +424,8 @@ def _mesh(at: At, frame: int, known: Known) -> Found:
     """One person, under the lens of joints in space and in the image, else the focal length."""
     place = v.rows(need(at, "pred_cam_t"), 1, 3)
     verts = v.tensor(v.stacked(need(at, "pred_vertices"), 3) + place)
-    joints, pixels = either(at, "pred_keypoints_3d"), either(at, "pred_keypoints_2d")
-    focal = either(at, "focal_length")
+    joints, pixels = maybe(at, "pred_keypoints_3d"), maybe(at, "pred_keypoints_2d")
+    focal = maybe(at, "focal_length")
     f = known.focal if focal is None else v.one_number(focal)
     assumed = dataclasses.replace(known, focal=f)
     given = None if f is None else assumed_lens(assumed, lambda *_: f)

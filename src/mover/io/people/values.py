@@ -13,16 +13,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mover.core.errors import InputError
-from mover.core.files import reason
+from mover.core.files import unreadable
 from mover.core.pickles import load_plain
 from mover.core.records import BROKEN
 from mover.io.files.fields import (
     LARGEST,
-    LARGEST_FILE,
     LAST_INDEX,
     At,
-    get,
+    existing,
     mapping,
+    maybe,
     read_json,
     refuse,
 )
@@ -37,16 +37,6 @@ LEAST_TURN = 0.05  # an array of matrices whose rows are not unit vectors within
 def named(path: Path) -> Path:
     """A path that has a name for messages, as `.` has not."""
     return path if path.name not in ("", "..") else path.resolve()
-
-
-def existing(path: Path) -> Path:
-    """The path of a file that is there and not too large."""
-    if not path.is_file():
-        raise InputError(f"{path.name}: there is no such file in {path.parent}")
-    if path.stat().st_size > LARGEST_FILE:
-        size = path.stat().st_size
-        raise InputError(f"{path.name}: has {size} bytes, expected at most {LARGEST_FILE}")
-    return path
 
 
 def read_any(path: Path) -> At:
@@ -66,7 +56,7 @@ def read_any(path: Path) -> At:
     except ValueError:  # a pickled object
         return At(load_plain(path), path.name)
     except BROKEN as error:
-        raise InputError(f"{path.name}: cannot be read ({reason(error, path)})") from error
+        raise unreadable(path, error, "an .npy file") from error
 
 
 def files_of(path: Path, pattern: str, what: str) -> list[Path]:
@@ -127,7 +117,7 @@ def natural(path: Path) -> tuple[tuple[int, str], ...]:
 
 def need(at: At, *names: str) -> At:
     """The first of several names of a field that is there."""
-    found = either(at, *names)
+    found = maybe(at, *names)
     if found is None:
         place = f"{at.place}: " if at.field else f"{at.file}: "
         wanted = " or ".join(f"'{name}'" for name in names)
@@ -138,12 +128,6 @@ def need(at: At, *names: str) -> At:
             known += f"; this is {AMASS}"
         raise InputError(f"{place}there is no key {wanted}, found {known}")
     return found
-
-
-def either(at: At, *names: str) -> At | None:
-    """The first of several names of a field that is there and not null, None without."""
-    given = mapping(at)
-    return next((get(at, name) for name in names if given.get(name) is not None), None)
 
 
 def people_of(at: At) -> list[tuple[int, At]]:
