@@ -17,7 +17,7 @@ from mover.geometry.camera import project
 from mover.geometry.rle import encode
 from mover.io.capture.bodies_file import bodies_of, bodies_to_arrays
 from mover.io.capture.folder import read_capture, write_capture
-from mover.io.capture.merge import _added, import_into
+from mover.io.capture.merge import import_into, with_parts
 from mover.io.capture.parts import Parts
 from mover.io.capture.tracks import join_pieces, pair_tracks, paired
 from mover.io.files.fields import At
@@ -201,7 +201,7 @@ def test_what_may_be_another_person_is_named_and_not_joined(case: str):
 
 def merged(*files: Bodies) -> tuple[Bodies, list[str]]:
     parts = [Parts("", bodies=At(bodies_to_arrays(one), f"{k}.npz")) for k, one in enumerate(files)]
-    whole = functools.reduce(_added, parts)
+    whole = functools.reduce(with_parts, parts)
     assert whole.bodies is not None
     return bodies_of(whole.bodies, lambda _: None), list(whole.notes)
 

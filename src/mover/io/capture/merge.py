@@ -61,7 +61,7 @@ def import_into(folder: Path, *given: Parts) -> Imported:
     if not new and not folder.is_dir():
         raise InputError(f"{folder}: is a file, expected a folder for the capture")
     old = Parts(folder.resolve().name) if new else replace(folder_parts(folder), beside={})
-    whole = functools.reduce(_added, given, old)
+    whole = functools.reduce(with_parts, given, old)
     if whole.objects is None and whole.scene is not None and whole.camera is not None:
         size = {"width": whole.camera.value.get("w"), "height": whole.camera.value.get("h")}
         empty = {"images": [{"id": 0, **size}], "categories": [], "annotations": []}
@@ -81,7 +81,7 @@ def import_into(folder: Path, *given: Parts) -> Imported:
     return Imported(capture, tuple(written), _missing(whole), whole.notes)
 
 
-def _added(old: Parts, new: Parts) -> Parts:
+def with_parts(old: Parts, new: Parts) -> Parts:
     """The new parts before the old ones; annotations and bodies of both are brought together.
 
     The newer camera has the tilt and the height of the older one where it has none. The tilt is
