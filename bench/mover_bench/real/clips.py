@@ -37,7 +37,7 @@ from mover.perceive.capture import read_picture_of
 from mover.perceive.layout import Picture
 from mover_bench.experiment.args import ExperimentArgs
 
-VIEW = 65.0  # [degrees], horizontal, of a clip whose lens nobody measured
+VIEW = 65.0  # [degrees], horizontal, of a clip whose lens was not measured
 STEP_UP = 0.15  # [m] that a seat may reach into its sitter and still be below
 LOWEST = 0.1  # of the skin over a seat that may be in it: a mattress gives way
 SURE = 0.5  # least confidence of a joint whose distance counts

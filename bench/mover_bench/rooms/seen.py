@@ -4,7 +4,7 @@ Nothing is learnt here: masks and joints are the truth with the errors of detect
 way from a video to a room can be judged where no weights are. People's and objects' masks are as in
 `NoiseConfig`. Joints are those of another body: where a network has been taught to see hips, knees
 and shoulders is lastingly beside the joints of the model, mirrored on both sides, and somewhat
-different for each person. Measured on a man 320 px tall who sits still (three networks): 1.1 to
+different for each person. Measured on a seated man 320 px tall (three networks): 1.1 to
 1.6 px are new in each frame, at least 1.8 px last. Limbs that furniture hides are guessed, for
 seconds in the same wrong place, by some networks with full confidence.
 """
