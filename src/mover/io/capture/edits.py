@@ -121,23 +121,32 @@ def joined(edits: Sequence[Edit], new: Edit) -> tuple[Edit, ...]:
 
 
 def _placed(one: SceneObject, at: Placement, scene: Scene) -> SceneObject:
-    """The object where an edit puts it, carried from the edit's world to that of the scene."""
+    """The object where an edit puts it, carried from the edit's world to that of the scene.
+
+    Its front is the level direction that `recast` turns back into the edit's: a pinned object
+    returns exactly when a run finds that camera.
+    """
     t, yaw, scale = (torch.tensor(x).float() for x in (at.translation, at.yaw, at.scale))
     put = replace(one, t_world_object=t, yaw=yaw, scale=scale, segments=())
-    old = tilted(torch.tensor(at.pitch), torch.tensor(at.roll))
-    return carried(put, old, scene.camera.R_cam_world)
+    old, new = tilted(torch.tensor(at.pitch), torch.tensor(at.roll)), scene.camera.R_cam_world
+    front, up_old, up_new = old @ facing(yaw), old[:, 1], new[:, 1]
+    return carried(put, front - up_old * (front @ up_new) / (up_old @ up_new), old, new)
 
 
-def carried(one: SceneObject, old: Float[Tensor, "3 3"], new: Float[Tensor, "3 3"]) -> SceneObject:
+def facing(yaw: Float[Tensor, ""]) -> Float[Tensor, "3"]:
+    """The front of an upright object in the world."""
+    return torch.stack([yaw.sin(), torch.zeros_like(yaw), yaw.cos()])
+
+
+def carried(
+    one: SceneObject, front: Float[Tensor, "3"], old: Float[Tensor, "3 3"],
+    new: Float[Tensor, "3 3"],
+) -> SceneObject:  # fmt: skip
     """The object in the world that another tilt of the camera (R_cam_world) gives.
 
-    Its box keeps its centre in the camera frame. Its front is the level direction that `recast`
-    turns back into the old one: a pinned object returns exactly when a run finds that camera.
+    Its box keeps its centre in the camera frame, and it faces a direction of that frame.
     """
-    center = to_world(to_camera(box_of(one).center, old), new)
-    front = old @ torch.stack([one.yaw.sin(), torch.zeros_like(one.yaw), one.yaw.cos()])
-    up_old, up_new = old[:, 1], new[:, 1]
-    level = to_world(front - up_old * (front @ up_new) / (up_old @ up_new), new)
+    center, level = to_world(to_camera(box_of(one).center, old), new), to_world(front, new)
     turned = replace(one, yaw=torch.atan2(level[0], level[2]))
     return replace(turned, t_world_object=one.t_world_object + center - box_of(turned).center)
 

@@ -18,7 +18,7 @@ from mover.io.capture.annotations_file import detections_of, people_of
 from mover.io.capture.bodies_file import bodies_of, bodies_to_arrays, write_bodies
 from mover.io.capture.build import build_capture
 from mover.io.capture.camera_file import camera_of, turned
-from mover.io.capture.edits import carried
+from mover.io.capture.edits import carried, facing
 from mover.io.capture.folder import REFERENCE, folder_parts, read_capture, write_trees
 from mover.io.capture.pairing import linked, named_rows, pair_rows
 from mover.io.capture.parts import UNKNOWN, Parts
@@ -200,7 +200,7 @@ def _capture(whole: Parts) -> Capture | None:
     if whole.tilt is not None:
         old, new = scene.camera.R_cam_world, turned(camera_of(whole.camera))[0].R_cam_world
         if float((old - new).abs().max()) >= SMALL_TURN:
-            objects = tuple(carried(one, old, new) for one in scene.objects)
+            objects = tuple(carried(o, old @ facing(o.yaw), old, new) for o in scene.objects)
             scene = Scene(replace(scene.camera, R_cam_world=new), None, objects)
     links = linked(scene, whole.objects)
     objects = (replace(p, annotation=links.get(p.id, p.annotation)) for p in scene.objects)
