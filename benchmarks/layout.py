@@ -106,7 +106,7 @@ def best_hypothesis(first: FirstScene, truth: Scene) -> float:
 
 def main() -> None:
     """Measure and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(100, 110)))
     parser.add_argument("--job", nargs="*", choices=("noise", "alone", "layout"),
                         default=["layout"],

@@ -69,10 +69,11 @@ def truth_of(room: KnownRoom, capture: Path) -> dict[str, int]:
     """Which true object each object of the first scene stands for: the best overlap of masks."""
     found = read_capture(capture)
     true = [decode(d.mask, 0) if d.mask else None for d in room.capture.detections]
-    by = {d.id: d for d in found.detections}
+    masks = {d.id: d.mask for d in found.detections}
     names: dict[str, int] = {}
     for piece in found.scene.objects:
-        mask = by[piece.annotation].mask
+        mask = None if piece.annotation is None else masks[piece.annotation]
+        assert mask is not None, "a first scene is made from masks"
         shared = [0 if t is None else int((decode(mask, 0) & t).sum()) for t in true]
         names[piece.id] = int(np.argmax(shared))
     return names
@@ -140,7 +141,7 @@ def judged(capture: Path, found: Path, room: KnownRoom) -> dict[str, Any]:
 
 
 def farther(metrics: dict[str, Any]) -> list[str]:
-    """Pieces that end farther from their true place than they began."""
+    """Objects that end farther from their true position than they started."""
     return [
         f"{piece['id']} {100 * before:.0f} to {100 * after:.0f} cm"
         for piece in metrics["objects"]

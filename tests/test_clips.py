@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from mover.core.errors import InputError
-from mover_bench.experiment.args import ExperimentArgs
-from mover_bench.real.clips import judge_clips, table_of, tops_below
+from mover_bench.cli import ExperimentArgs
+from mover_bench.experiment.judge_clips import judge_clips, table_of, tops_below
 
 
 def test_the_surface_under_a_point_is_the_highest_one_below_it():

@@ -29,8 +29,8 @@ from mover.geometry.raster import first_hit
 from mover.geometry.rle import encode, tight_box
 from mover.pipeline.presets import PRESETS, Config
 from mover.stages.people.refine_bodies import RefinedBodies
+from mover_bench.cli import ExperimentArgs
 from mover_bench.experiment import job, run
-from mover_bench.experiment.args import ExperimentArgs
 from mover_bench.experiment.measures import Judge, Trial
 from mover_bench.experiment.run import Jobs, run_each, run_experiment
 from mover_bench.experiment.sets import CHANGES, SETS, changed, parse_seeds

@@ -11,9 +11,9 @@ import torch
 from mover.core.errors import InputError
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import pitch_roll, tilted
-from mover_bench.experiment.args import ExperimentArgs
-from mover_bench.real.i3db import HALPE, JOINTS, read_i3db
-from mover_bench.real.judge import judge_i3db, overlaps, table_of, wrongly_placed
+from mover_bench.cli import ExperimentArgs
+from mover_bench.datasets.i3db import HALPE, JOINTS, read_i3db
+from mover_bench.experiment.judge_i3db import judge_i3db, overlaps, table_of, wrongly_placed
 
 REAL = Path(__file__).parents[2] / "shared" / "data" / "i3db"
 PITCH, FLOOR = math.radians(-5.0), -1.2

@@ -15,14 +15,14 @@ from test_import_scenes import imported
 from test_import_scenes import plain as plain  # the fixture
 
 from mover.pipeline.presets import PRESETS
+from mover_bench.cli import TableArgs
 from mover_bench.datasets.pigraphs import NAMES
-from mover_bench.experiment.args import TableArgs
+from mover_bench.experiment import paper_rows as rows
+from mover_bench.experiment.paper_job import TableJob, do_job
+from mover_bench.experiment.paper_rows import TABLES
+from mover_bench.experiment.paper_table import asked, paper_table
 from mover_bench.experiment.run import Jobs
 from mover_bench.rooms.known import KnownRoom
-from mover_bench.tables import rows
-from mover_bench.tables.paper_table import asked, paper_table
-from mover_bench.tables.rows import TABLES
-from mover_bench.tables.table_job import TableJob, do_job
 
 STILLS = ("vicon_03301_01", "vicon_03301_02")
 VIDEOS = ("MPH8_00034_01", "MPH8_00035_02")

@@ -1,1 +1,1 @@
-"""Readers of what the paper is measured on: PROX, PiGraphs, HolisticMesh, MOVER's release."""
+"""Readers of what results are measured on: PROX, PiGraphs, i3DB, HolisticMesh, MOVER's release."""

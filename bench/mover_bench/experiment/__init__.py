@@ -1,1 +1,1 @@
-"""One experiment on known rooms: variants of the method, room by room, and their tables."""
+"""Experiments on known rooms and real sets, and the tables of the paper."""

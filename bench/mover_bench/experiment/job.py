@@ -54,7 +54,7 @@ def with_noise(room: KnownRoom, seed: int, rooms: RoomSet) -> Trial:
 
 def key_of(rooms: RoomSet, seed: int, variant: Variant) -> str:
     """Digest of everything that the numbers of a variant depend on."""
-    made = rooms.room, rooms.noise, rooms.withheld, rooms.paths, rooms.version
+    made = rooms.room, rooms.noise, rooms.withheld, rooms.paths
     return records.fingerprint(*made, seed, variant, sources("mover_bench"))
 
 

@@ -87,15 +87,10 @@ class Judge:
 def measure_moves(truth: Scene, found: Scene, fps: float | None = None) -> dict[str, Any]:
     """Whether objects that are moved stand where they should when, and move when they should.
 
-    Args:
-        truth: The true scene.
-        found: The scene that is judged.
-        fps: Frames a second; None: errors of times are in frames.
-
     Returns:
         `objects` that are truly moved: IoU3D in each true stay, how far the nearest change is from
-        each true one [s] (None: none is), mean IoU3D while a person moves it; and how many others
-        are moved by mistake (`false`).
+        each true one [s; frames without `fps`] (None: none is), mean IoU3D while a person moves
+        it; and how many others are moved by mistake (`false`).
     """
     pieces = {piece.id: piece for piece in found.objects}
     rows: list[dict[str, Any]] = []

@@ -11,7 +11,7 @@ from threading import Event, Lock
 
 from mover.core.errors import InputError
 from mover.core.observe import Observer, Step, silent
-from mover_bench.experiment.args import ExperimentArgs
+from mover_bench.cli import ExperimentArgs
 from mover_bench.experiment.job import is_finished
 from mover_bench.experiment.sets import parse_seeds, set_named
 from mover_bench.experiment.tables import LOG, read_finished, write_tables

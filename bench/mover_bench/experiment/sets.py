@@ -24,8 +24,6 @@ class RoomSet:
     """Rooms to choose settings on; none is held out."""
     room: RoomConfig = field(default_factory=RoomConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
-    version: int = 1
-    """Counts up whenever a room of the set changes."""
     withheld: Literal["seat"] | None = None
     """What no detector saw: `rooms.noise.without_seat`."""
     paths: tuple[PathConfig, ...] = (PathConfig(),)

@@ -15,7 +15,7 @@ from mover.app.report.tables import SHOWN, shown
 from mover.core.files import replacing
 from mover.core.records import plain
 from mover.evaluate.evaluation import METRICS
-from mover_bench.experiment.args import ExperimentArgs
+from mover_bench.cli import ExperimentArgs
 from mover_bench.experiment.job import path_of, read_numbers
 from mover_bench.experiment.sets import set_named
 from mover_bench.experiment.variants import VARIANTS

@@ -74,17 +74,8 @@ def _subsets(preset: str, prefix: str) -> dict[str, Variant]:
     return {n: with_terms(PRESETS[preset], *s) for n, s in zip(names, subsets, strict=True)}
 
 
-def _without_walls(config: Config) -> Config:
-    layout = replace(config.layout, wall_alignment_steps=0)
-    place = replace(config.place, wall_alignment_steps=0)
-    return replace(config, layout=layout, place=place)
-
-
-def _without_given(config: Config) -> Config:
-    layout = replace(config.layout, weights=replace(config.layout.weights, given=0.0))
-    return weighted(replace(config, layout=layout), given=0.0)
-
-
+NO_WALLS = {s: replace(getattr(ROBUST, s), wall_alignment_steps=0) for s in ("layout", "place")}
+NOT_GIVEN = replace(ROBUST.layout, weights=replace(ROBUST.layout.weights, given=0.0))
 LISTS: dict[str, dict[str, Variant]] = {
     "ablation": {
         "robust": Variant(ROBUST),
@@ -107,9 +98,9 @@ LISTS: dict[str, dict[str, Variant]] = {
         "no-refined-camera": Variant(replace(ROBUST, refine=replace(ROBUST.refine, rounds=0))),
         "no-yaw-starts": Variant(replace(ROBUST, layout=replace(ROBUST.layout, yaws=1))),
         "no-second-pass": Variant(replace(ROBUST, outer_iterations=0)),
-        "no-walls": Variant(_without_walls(ROBUST)),
+        "no-walls": Variant(replace(ROBUST, **NO_WALLS)),
         "no-learnt-sizes": Variant(replace(ROBUST, sizes=SpreadConfig())),
-        "no-given": Variant(_without_given(ROBUST)),
+        "no-given": Variant(weighted(replace(ROBUST, layout=NOT_GIVEN), given=0.0)),
         "no-lens": Variant(replace(ROBUST, lens=LensConfig())),
         "no-scale": Variant(replace(ROBUST, height_spread=0.0)),
         "no-seat-heights": Variant(replace(ROBUST, seat_heights=False)),

@@ -247,7 +247,7 @@ def _furnished(
 ) -> tuple[Plan, float]:
     """One room, and how many of its objects are well occluded."""
     view = draw_view(rng, size, config)
-    wide, deep = float(rng.uniform(*config.wide)), float(rng.uniform(*config.far))
+    wide, deep = float(rng.uniform(4.6, 5.4)), float(rng.uniform(5.6, 6.4))  # of the floor [m]
     plan, value = Plan((), view, (-wide / 2, -deep), (wide / 2, -1.9)), 0.0
     few = SPARE * least * (WIDTH / size[0]) ** 2
     drawn: list[Float[Tensor, "h w"]] = []

@@ -15,8 +15,6 @@ class PlanConfig:
     look_down: tuple[float, float] = (8.0, 14.0)
     """Of a camera 1.2 m high; one that is higher by 1 m looks down 4 more [degrees]."""
     field_of_view: tuple[float, float] = (61.0, 69.0)  #: of the image's width [degrees]
-    wide: tuple[float, float] = (4.6, 5.4)  #: of the floor, from left to right [m]
-    far: tuple[float, float] = (5.6, 6.4)  #: from the camera to the wall behind the furniture [m]
     visible: float = 0.85  #: least share of an object's vertices inside the image
     hidden: float = 0.75  #: largest share of an object that others may occlude
     crowded: float = 1 / 3

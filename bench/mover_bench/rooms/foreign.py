@@ -45,9 +45,12 @@ def foreign_mesh(known: Furniture, warp: float, rng: np.random.Generator) -> Mes
     maker = MAKERS[int(rng.integers(len(MAKERS)))]
     verts, faces = maker((verts * wanted, mesh.faces.numpy()), rng)
     verts = verts + warp * wanted * _waves(verts / wanted, rng)
-    torn = rng.uniform() < TORN
     out = Mesh(torch.from_numpy(verts).float(), torch.from_numpy(faces.astype(np.int64)))
-    out = used(_without_back(out)) if torn else used(out)
+    if rng.uniform() < TORN:  # what looks down or back is not there
+        normals = face_normals(out.verts, out.faces)
+        seen = ~((normals[:, 1] < -0.7) | (normals[:, 2] < -0.7))
+        out = Mesh(out.verts, out.faces[seen]) if int(seen.sum()) > 50 else out
+    out = used(out)
     high = torch.tensor([wanted[0] / 2, wanted[1], wanted[2] / 2]).float()
     return fit_box(out, high * torch.tensor([-1.0, 0.0, -1.0]), high)
 
@@ -66,13 +69,6 @@ def _waves(at: Float[np.ndarray, "verts 3"], rng: np.random.Generator) -> np.nda
         wave, phase = rng.normal(0, 3.0, 3), rng.uniform(0, 2 * np.pi)
         total += np.sin(at @ wave + phase)[:, None] * rng.normal(size=3)
     return total / np.sqrt(2.0)
-
-
-def _without_back(mesh: Mesh) -> Mesh:
-    """Without the faces that look down or back."""
-    normals = face_normals(mesh.verts, mesh.faces)
-    unseen = (normals[:, 1] < -0.7) | (normals[:, 2] < -0.7)
-    return Mesh(mesh.verts, mesh.faces[~unseen]) if int((~unseen).sum()) > 50 else mesh
 
 
 def _grid(

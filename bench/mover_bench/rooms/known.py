@@ -173,7 +173,7 @@ def in_camera(plan: Plan, actors: Sequence[Actor], index: Tensor) -> BodyPose:
 
 @record
 class Shown:
-    """What is seen of everybody, row by row."""
+    """What is seen of each body."""
 
     people: People
     """Masks without what furniture or a nearer person hides."""

@@ -11,29 +11,10 @@ from jaxtyping import Float
 
 from mover.core.records import record
 from mover.geometry.warp_start import mapped
+from mover_bench.rooms import resting
 from mover_bench.rooms.gait import duration, stations, walk
 from mover_bench.rooms.placed import NoWayError, Placed, way
 from mover_bench.rooms.poses import SIDES, Person, Posture, blend, chain, rows
-from mover_bench.rooms.resting import (
-    LIE_TIME,
-    REACH_TIME,
-    SIT_TIME,
-    before,
-    berth,
-    hand_on,
-    leaning,
-    lie_down,
-    on_side,
-    reach_out,
-    roll_over,
-    seat_spot,
-    seated,
-    settle_down,
-    sit_down,
-    standing,
-    supine,
-    table_stand,
-)
 from mover_bench.rooms.truth import faults
 from mover_bench.rooms.turns import facing, smooth
 
@@ -123,7 +104,7 @@ def perform(
         else:
             takes, here = takes + new, stop
     if not takes:
-        takes = [Take(standing(stage.person, start.place, start.heading), "walk", -1)]
+        takes = [Take(resting.standing(stage.person, start.place, start.heading), "walk", -1)]
     count = [len(t.posture.pelvis) for t in takes]
     labels = tuple(t.label for t, n in zip(takes, count, strict=True) for _ in range(n))
     touched = tuple(t.piece for t, n in zip(takes, count, strict=True) for _ in range(n))
@@ -161,12 +142,12 @@ def stop_for(stage: Stage, task: Task, here: Stop) -> Stop:
         ahead = goal - here.place
         return Stop(goal, float(np.arctan2(ahead[0], ahead[1])), goal)
     if task.kind == "table":
-        place, heading = table_stand(stage.pieces, task.piece, task.side, task.along)
+        place, heading = resting.table_stand(stage.pieces, task.piece, task.side, task.along)
         return Stop(place, heading, place - DOOR * facing(np.array(heading)))
-    spot = seat_spot(stage.pieces, task.piece, task.along)
+    spot = resting.seat_spot(stage.pieces, task.piece, task.along)
     if task.kind == "lie":
-        spot = berth(stage.person, stage.pieces, task.piece, task.side).spot
-    place = before(stage.person, spot)
+        spot = resting.berth(stage.person, stage.pieces, task.piece, task.side).spot
+    place = resting.before(stage.person, spot)
     return Stop(place, spot.heading, place + DOOR * facing(np.array(spot.heading)))
 
 
@@ -180,18 +161,18 @@ def _shares(stage: Stage, seconds: float) -> Float[np.ndarray, " frames"]:
 
 
 def _still(stage: Stage, posture: Posture, seconds: float, phase: float, amount: float) -> Posture:
-    return settle_down(posture, _times(stage, seconds), phase, amount)
+    return resting.settle_down(posture, _times(stage, seconds), phase, amount)
 
 
 def _sit(stage: Stage, task: Task, stop: Stop, phase: float) -> list[Take]:
     piece = stage.pieces[task.piece]
-    spot = seat_spot(stage.pieces, task.piece, task.along)
-    sitting = seated(stage.person, spot, piece)
-    down = sit_down(stage.person, sitting, stop.heading, _shares(stage, SIT_TIME))
+    spot = resting.seat_spot(stage.pieces, task.piece, task.along)
+    sitting = resting.seated(stage.person, spot, piece)
+    down = resting.sit_down(stage.person, sitting, stop.heading, _shares(stage, resting.SIT_TIME))
     if task.kind == "sit":
         parts = [("sit", _still(stage, sitting, task.seconds, phase, 1.0))]
     else:
-        back = leaning(stage.person, sitting, piece)
+        back = resting.leaning(stage.person, sitting, piece)
         move = blend(sitting, back, smooth(_shares(stage, 1.0)))
         parts = [
             ("sit", _still(stage, sitting, 1.6, phase, 1.0)), ("sit", move),
@@ -203,18 +184,18 @@ def _sit(stage: Stage, task: Task, stop: Stop, phase: float) -> list[Take]:
 
 def _lie(stage: Stage, task: Task, stop: Stop, phase: float) -> list[Take]:
     person, piece = stage.person, stage.pieces[task.piece]
-    place = berth(person, stage.pieces, task.piece, task.side)
-    sitting = seated(person, place.spot, piece)
-    back = supine(person, place, piece)
-    down = sit_down(person, sitting, stop.heading, _shares(stage, SIT_TIME))
-    lay = lie_down(person, sitting, back, piece, _shares(stage, LIE_TIME))
+    place = resting.berth(person, stage.pieces, task.piece, task.side)
+    sitting = resting.seated(person, place.spot, piece)
+    back = resting.supine(person, place, piece)
+    down = resting.sit_down(person, sitting, stop.heading, _shares(stage, resting.SIT_TIME))
+    lay = resting.lie_down(person, sitting, back, piece, _shares(stage, resting.LIE_TIME))
     parts = [
         ("sit down", down), ("sit", _still(stage, sitting, 1.0, phase, 1.0)), ("lie down", lay),
         ("lie", _still(stage, back, task.seconds, phase, 0.0)),
     ]  # fmt: skip
     if task.roll:
-        side = on_side(person, back, place, piece)
-        roll = roll_over(person, back, side, piece, _shares(stage, 2.0))
+        side = resting.on_side(person, back, place, piece)
+        roll = resting.roll_over(person, back, side, piece, _shares(stage, 2.0))
         rest = _still(stage, rows(roll, slice(-1, None)), 0.6 * task.seconds, phase, 0.0)
         parts += [("lie", roll), ("lie", rest), ("lie", _reversed(roll))]
     parts += [("get up", _reversed(lay)), ("stand up", _reversed(down))]
@@ -223,9 +204,9 @@ def _lie(stage: Stage, task: Task, stop: Stop, phase: float) -> list[Take]:
 
 def _table(stage: Stage, task: Task, stop: Stop, phase: float) -> list[Take]:
     hand = int(phase > np.pi)
-    end = hand_on(stage.person, stop.place, stop.heading, stage.pieces[task.piece], hand)
-    stand = standing(stage.person, stop.place, stop.heading)
-    out = reach_out(end, stand, _shares(stage, REACH_TIME))
+    end = resting.hand_on(stage.person, stop.place, stop.heading, stage.pieces[task.piece], hand)
+    stand = resting.standing(stage.person, stop.place, stop.heading)
+    out = resting.reach_out(end, stand, _shares(stage, resting.REACH_TIME))
     still = _still(stage, end, task.seconds, phase, 0.3)
     parts = [("reach", out), (f"{SIDES[hand]} hand", still), ("reach", _reversed(out))]
     return [Take(posture, label, task.piece) for label, posture in parts]

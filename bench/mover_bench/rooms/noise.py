@@ -25,18 +25,10 @@ from mover.geometry.rle import decode
 from mover.geometry.rotations import rot_y
 from mover.geometry.warp_start import beside
 from mover.stages.camera.find_lens import through_lens
+from mover_bench.rooms import noise_masks as masks
 from mover_bench.rooms.config import NoiseConfig
 from mover_bench.rooms.foreign import foreign_mesh
 from mover_bench.rooms.known import KnownRoom, one_thread, rounded
-from mover_bench.rooms.noise_masks import (
-    headed,
-    leaking,
-    noisy_detections,
-    noisy_finds,
-    noisy_people,
-    without,
-    wobbling,
-)
 from mover_bench.rooms.turns import from_vector, to_vector
 
 SEATS_FOR_ONE = ("chair", "armchair", "office chair", "stool")
@@ -237,22 +229,22 @@ def add_noise(room: KnownRoom, noise: NoiseConfig, seed: int) -> Capture:
         objects = foreign_shapes(objects, room.furniture, noise, [seed, 10])
     detections = room.capture.detections
     if noise.mask_head or noise.mask_box or noise.amodal:
-        detections = headed(detections, room.truth, noise, stream(11))
-    detections = noisy_detections(detections, noise.object_masks, stream(3))
+        detections = masks.headed(detections, room.truth, noise, stream(11))
+    detections = masks.noisy_detections(detections, noise.object_masks, stream(3))
     bodies, people = beside(
         lambda: noisy_bodies(room, noise, stream(4)),
-        lambda: noisy_people(
+        lambda: masks.noisy_people(
             room.capture.people, noise.person_masks, noise.missed_masks, stream(5)
         ),
     )
     capture = replace(
         room.capture, scene=Scene(camera, None, objects), bodies=bodies,
-        people=wobbling(people, noise.wobble, stream(12)),
-        detections=leaking(detections, noise.leaks, stream(7)),
-        furniture=noisy_people(room.capture.furniture, noise.object_masks, 0.0, stream(14)),
+        people=masks.wobbling(people, noise.wobble, stream(12)),
+        detections=masks.leaking(detections, noise.leaks, stream(7)),
+        furniture=masks.noisy_people(room.capture.furniture, noise.object_masks, 0.0, stream(14)),
     )  # fmt: skip
     assert room.truth.ground is not None, "a known room has a floor"
-    capture = noisy_finds(capture, room.truth.ground, noise, [seed, 9])
+    capture = masks.noisy_finds(capture, room.truth.ground, noise, [seed, 9])
     capture = worn_picture(capture, noise, stream(15))
     return wrong_lens(capture, noise.lens, stream(13))
 
@@ -269,7 +261,7 @@ def without_seat(capture: Capture, room: KnownRoom) -> Capture:
     if not seats:
         return capture
     lost = room.truth.objects[max(single or seats, key=lambda k: used[k])]
-    return without(capture, {lost.annotation})
+    return masks.without(capture, {lost.annotation})
 
 
 def wrong_lens(capture: Capture, mean: float, rng: np.random.Generator) -> Capture:

@@ -23,11 +23,6 @@ SITS = frozenset({"chair", "armchair", "office chair", "sofa", "stool", "bench"}
 STANDS = frozenset({"table", "desk", "cabinet"})
 
 
-def draw_person(rng: np.random.Generator) -> list[float]:
-    """Shape coefficients of an adult."""
-    return [float(b) for b in np.clip(rng.normal(0, 0.7, 4), -1.4, 1.4)] + [0.0] * 6
-
-
 def free_place(plan: Plan, rng: np.random.Generator) -> np.ndarray:
     """A place to stand with room around it, in view of the camera (x, z) [m].
 
@@ -40,12 +35,6 @@ def free_place(plan: Plan, rng: np.random.Generator) -> np.ndarray:
         if abs(place[0]) < 0.5 * -place[1] and free_of(place, plan.pieces, ROOMY):
             return place
     raise ValueError("the room has no free floor")
-
-
-def draw_start(plan: Plan, rng: np.random.Generator) -> Stop:
-    """Where a person is when the video begins."""
-    place = free_place(plan, rng)
-    return Stop(place, float(rng.uniform(-np.pi, np.pi)), place)
 
 
 def draw_tasks(
@@ -123,7 +112,7 @@ def make_room(seed: int, config: RoomConfig | None = None) -> KnownRoom:
 def cast(
     plan: Plan, config: RoomConfig, rng: np.random.Generator, refused: list[str]
 ) -> tuple[Actor, ...]:
-    """Everybody's performance."""
+    """The performances of all people."""
     if len(plan.pieces) < config.least_pieces:
         raise RefusedError(f"only {len(plan.pieces)} pieces fit")
     actors: list[Actor] = []
@@ -144,11 +133,13 @@ def cast(
 def _actor(plan: Plan, config: RoomConfig, rng: np.random.Generator) -> Actor:
     """A person of a random shape who does random things."""
     bounds = np.stack([plan.walls[0] + 0.25, plan.walls[1] - 0.25])
-    stage = Stage(make_person(draw_person(rng)), plan.pieces, bounds, config.fps)
+    adult = [float(b) for b in np.clip(rng.normal(0, 0.7, 4), -1.4, 1.4)] + [0.0] * 6
+    stage = Stage(make_person(adult), plan.pieces, bounds, config.fps)
     try:
-        tasks, start = draw_tasks(plan, rng, config.stay, config.acts), draw_start(plan, rng)
+        tasks, place = draw_tasks(plan, rng, config.stay, config.acts), free_place(plan, rng)
     except ValueError as error:
         raise RefusedError(str(error)) from error
+    start = Stop(place, float(rng.uniform(-np.pi, np.pi)), place)
     return Actor(stage, perform(stage, tasks, start, rng, config.most_frames))
 
 
@@ -227,7 +218,7 @@ def demo_plan() -> tuple[Plan, Actor]:
 
 @one_thread()
 def draw_frame(room: KnownRoom, frame: int) -> Float[Tensor, "h w 3"]:
-    """A picture of the room with everybody in it, in [0, 1]."""
+    """A picture of the room with all people in it, in [0, 1]."""
     rows = torch.nonzero(room.bodies.frame == frame)[:, 0].tolist()
     meshes = [Mesh(room.bodies.verts[k], room.bodies.faces) for k in rows]
     return draw_bodies(room.plan, see(room.plan), meshes)

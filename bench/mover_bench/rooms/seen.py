@@ -90,7 +90,7 @@ class Seen:
     def joints(
         self, inputs: JointsInputs, _config: ModelsConfig, _observe: Observer = silent
     ) -> Keypoints:
-        """COCO's 17 joints of everybody whose mask is known."""
+        """COCO's 17 joints of all people whose masks are known."""
         tracks, frames = inputs.tracks, self.frames_of(inputs.clip)
         which = self._bodies(tracks, frames)
         bodies, camera = self.room.bodies, self.room.truth.camera
@@ -127,15 +127,9 @@ def spoilt(
     wrong: Float[np.ndarray, "rows 17 2"],
     rng: np.random.Generator,
 ) -> tuple[Float[Tensor, "rows 17 2"], Float[Tensor, "rows 17"]]:
-    """Joints with a detector's errors [px], and its confidence in them.
+    """Joints (in camera axes [m]) with a detector's errors [px], and its confidence in them.
 
-    Args:
-        points: In camera axes [m].
-        inside: Those that are seen.
-        camera: Of the image.
-        person: Of each row.
-        wrong: Errors of guesses, in units of their standard deviation.
-        rng: Of the network and the people.
+    Joints that are not `inside` are guessed, with errors `wrong` [standard deviations].
     """
     names = LAYOUTS["coco17"]
     left, right = (

@@ -45,12 +45,6 @@ def part(name: str) -> Bool[np.ndarray, " verts"]:
     return np.isin(joint, wanted)
 
 
-def part_of(vertex: int) -> str:
-    """Name of the joint that moves a vertex most."""
-    model = open_body()
-    return model.joint_names[int(model.weights[vertex].argmax())]
-
-
 def gap(person: Person, posture: Posture, piece: Placed, group: str) -> float:
     """Distance from a part of the body (one frame) to a piece; negative: inside [m]."""
     return float(distances(piece, skinned(person, posture, part(group))[0], 0.6).min())
@@ -167,7 +161,9 @@ def faults(
         near = around(piece, skin, boxes, 0.0)
         deep = -float(near.min())
         if deep > SINK:
-            where = part_of(int(near.argmin()) % skin.shape[1])
+            model = open_body()
+            joint = int(model.weights[int(near.argmin()) % skin.shape[1]].argmax())
+            where = model.joint_names[joint]
             found.append(f"{label}: {where} {100 * deep:.1f} cm inside {piece.id}")
     for name in RESTS.get(label, ()):
         mask = part(name)

@@ -35,7 +35,8 @@ from mover.io.capture.scene_file import read_scene
 from mover.io.people.keypoints import read_keypoints
 from mover.perceive.capture import read_picture_of
 from mover.perceive.layout import Picture
-from mover_bench.experiment.args import ExperimentArgs
+from mover_bench.cli import ExperimentArgs
+from mover_bench.experiment.tables import markdown
 
 VIEW = 65.0  # [degrees], horizontal, of a clip whose lens was not measured
 STEP_UP = 0.15  # [m] that a seat may reach into its sitter and still be below
@@ -78,13 +79,10 @@ def judge_clips(args: ExperimentArgs, observe: Observer = silent) -> Path:
 
 def table_of(found: dict[str, dict[str, Any]]) -> str:
     """A row for each object of each clip."""
-    lines = ["| clip | " + " | ".join(COLUMNS.values()) + " |", "|---" * (len(COLUMNS) + 1) + "|"]
-    for name, clip in found.items():
-        for row in clip["objects"]:
-            cells = [{**clip, **row}.get(key) for key in COLUMNS]
-            lines.append(f"| {name} | " + " | ".join("" if c is None else str(c) for c in cells))
-            lines[-1] += " |"
-    return "\n".join([*lines, ""])
+    rows = [(name, {**clip, **row}) for name, clip in found.items() for row in clip["objects"]]
+    cells = [(name, *(row.get(key) for key in COLUMNS)) for name, row in rows]
+    lines = [["" if cell is None else str(cell) for cell in line] for line in cells]
+    return markdown(["clip", *COLUMNS.values()], lines) + "\n"
 
 
 def judge_room(folder: Path) -> dict[str, Any]:

@@ -27,8 +27,9 @@ from mover.perceive.layout import Picture, first_scene
 from mover.perceive.standing import seen_from
 from mover.pipeline.presets import PRESETS
 from mover.pipeline.reconstruct import reconstruct
-from mover_bench.experiment.args import ExperimentArgs
-from mover_bench.real.i3db import I3dbScene, read_i3db
+from mover_bench.cli import ExperimentArgs
+from mover_bench.datasets.i3db import I3dbScene, read_i3db
+from mover_bench.experiment.tables import markdown
 
 LEVEL = tilted(torch.tensor(0.0), torch.tensor(0.0))
 POINTS = 1  # of surfaces, which are not compared
@@ -74,12 +75,10 @@ COLUMNS = {
 
 def table_of(found: dict[str, dict[str, Any]]) -> str:
     """The numbers as a table, with the mean of each overlap over the scenes."""
-    lines = ["| scene | " + " | ".join(COLUMNS.values()) + " |", "|---" * (len(COLUMNS) + 1) + "|"]
-    for name, row in found.items():
-        lines.append(f"| {name} | " + " | ".join(f"{row[key]:.3f}" for key in COLUMNS) + " |")
+    lines = [[name, *(f"{row[key]:.3f}" for key in COLUMNS)] for name, row in found.items()]
     overlaps = list(COLUMNS)[:5]
     means = [f"{sum(row[key] for row in found.values()) / len(found):.3f}" for key in overlaps]
-    return "\n".join([*lines, "| mean | " + " | ".join([*means, "", "", ""]) + " |", ""])
+    return markdown(["scene", *COLUMNS.values()], [*lines, ["mean", *means, "", "", ""]]) + "\n"
 
 
 def judge_scene(scene: I3dbScene, run: Run, preset: str) -> dict[str, Any]:

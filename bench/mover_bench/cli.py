@@ -1,11 +1,14 @@
-"""What the bench's commands can be asked for. Imports no torch: `--help` is quick."""
+"""The bench's commands, `experiment` and `paper-table`. Imports no torch: `--help` is quick."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from mover.app.cli import say
+from mover.app.cli.config import parsed
 from mover.core.settings import int_in
 
 Workers = Annotated[int, int_in(0, 10_000)]
@@ -56,8 +59,6 @@ class TableArgs:
     """The same captures with boxes and masks of a detector (PointRend), for rows of their own."""
     only: tuple[str, ...] = ()
     """Rows whose names begin so, as initial full; empty: all."""
-    steps: Annotated[int, int_in(0, 1_000_000)] = 0
-    """At most so many steps of each descent; 0: as many as the preset has."""
     device: Literal["auto", "cpu", "cuda"] = "cpu"
     """Where the heavy stages compute: a GPU shortens the steps of `paper` and `printed`."""
     vposer: Path | None = None
@@ -66,3 +67,28 @@ class TableArgs:
     """How many jobs run at once; 0: as many as there are cores."""
     look: bool = False
     """Run nothing: write the page from the jobs that are finished."""
+
+
+def experiment(arguments: Sequence[str]) -> None:
+    """`mover experiment`."""
+    args = parsed(ExperimentArgs, "mover experiment", arguments)
+    from mover.app.cli.progress import Bar
+    from mover_bench.experiment.judge_clips import judge_clips
+    from mover_bench.experiment.judge_i3db import judge_i3db
+    from mover_bench.experiment.run import run_experiment
+
+    real = {"i3db": judge_i3db, "clips": judge_clips}  # all other sets are known rooms
+    with Bar() as bar:
+        summary = real.get(args.set, run_experiment)(args, bar)
+    say(f"{summary.read_text()}\nsummary: {summary}")
+
+
+def show_paper_table(arguments: Sequence[str]) -> None:
+    """`mover paper-table`."""
+    args = parsed(TableArgs, "mover paper-table", arguments)
+    from mover.app.cli.progress import Bar
+    from mover_bench.experiment.paper_table import paper_table
+
+    with Bar() as bar:
+        page = paper_table(args, bar)
+    say(f"{page.read_text()}\ntable: {page}")

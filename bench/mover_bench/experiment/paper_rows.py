@@ -7,17 +7,16 @@ on known rooms. None: not printed.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from mover.pipeline.presets import PRESETS
 from mover_bench.datasets import pigraphs, prox_files
+from mover_bench.experiment.sets import CHANGES
 from mover_bench.experiment.variants import LENGTHS, SEGMENTS, TERMS, Cut, Variant, with_terms
 
 PLAIN, INITIAL, BASELINE, FITS = "full", "initial", "people-baseline", "fits-"
 """Jobs: the whole method; the given scene alone; bodies without a room; names of given fits."""
-NOISES: Mapping[str, tuple[float, ...]] = {
-    "scale": (0.25, 0.15, 0.05), "place": (0.3, 0.2, 0.1), "turn": (45.0, 30.0, 15.0),
-}  # fmt: skip
+NOISES = {kind: CHANGES[kind].levels[:0:-1] for kind in ("scale", "place", "turn")}
 """Largest uniform errors of the initial scene: share of the size, [m], [degrees]."""
 
 
@@ -57,17 +56,6 @@ def variants(preset: str) -> dict[str, Variant]:
         **{name: Variant(config, cut=cut) for name, cut in cuts.items()},
         **{f"noise-{k}-{x:g}": Variant(config, change=f"{k}={x:g}") for k, x in noises},
     }
-
-
-def at_most(variant: Variant, steps: int) -> Variant:
-    """The same with at most so many steps of each descent; 0: as it is."""
-    config = variant.config
-    stages = {"layout": config.layout, "place": config.place}
-    fewer = {
-        name: replace(one, method=replace(one.method, steps=min(one.method.steps, steps)))
-        for name, one in stages.items()
-    }
-    return replace(variant, config=replace(config, **fewer)) if steps else variant
 
 
 ABLATION = (

@@ -1,6 +1,6 @@
 """One job of a table: rebuild a capture of the user's as a row asks, and measure it.
 
-Each job is a process (`python -m mover_bench.tables.table_job WORD ...`, see `TableJob.words`);
+Each job is a process (`python -m mover_bench.experiment.paper_job WORD ...`, see `TableJob.words`);
 jobs of a capture share its finished stages, and a finished job is a file under a digest of its
 inputs.
 """
@@ -33,8 +33,8 @@ from mover.pipeline.result import to_world
 from mover.stages.config import RefineBodiesConfig
 from mover.stages.people.refine_bodies import ABLATION, refine_bodies
 from mover_bench.experiment.measures import under_camera
+from mover_bench.experiment.paper_rows import BASELINE, FITS, INITIAL, PLAIN, variants
 from mover_bench.experiment.variants import Variant, withheld
-from mover_bench.tables.rows import BASELINE, FITS, INITIAL, PLAIN, at_most, variants
 
 DONE = "metrics.json"
 FITTED = "fitted.npz"
@@ -51,9 +51,7 @@ class TableJob:
     """Folder of all results."""
     preset: str
     name: str
-    """A variant of `rows.variants`."""
-    steps: int = 0
-    """At most so many steps of each descent; 0: as many as the preset has."""
+    """A variant of `paper_rows.variants`."""
     device: Choice = "cpu"
     vposer: str = ""
     """VPoser's weights: the bodies of the rows of people are fitted with them."""
@@ -61,15 +59,15 @@ class TableJob:
     @property
     def words(self) -> tuple[str, ...]:
         """The command line of its process."""
-        return (str(self.capture), str(self.out), self.preset, self.name, str(self.steps),
-                self.device, self.vposer)  # fmt: skip
+        capture, out = str(self.capture), str(self.out)
+        return (capture, out, self.preset, self.name, self.device, self.vposer)
 
     @staticmethod
     def of(words: Sequence[str]) -> "TableJob":
         """The inverse of `words`."""
-        capture, out, preset, name, steps, device, vposer = words
+        capture, out, preset, name, device, vposer = words
         choice: Any = device
-        return TableJob(Path(capture), Path(out), preset, name, int(steps), choice, vposer)
+        return TableJob(Path(capture), Path(out), preset, name, choice, vposer)
 
     @property
     def home(self) -> Path:
@@ -84,7 +82,7 @@ class TableJob:
     @property
     def variant(self) -> Variant:
         """Its settings."""
-        return at_most(variants(self.preset)[self.name], self.steps)
+        return variants(self.preset)[self.name]
 
 
 def key_of(job: TableJob) -> str:

@@ -8,11 +8,9 @@ Frames count from 1, ten a second; in some scenes only even ones were annotated,
 taken of all. The videos are not there: masks are the drawn parts (the paper's protocol "2D GT").
 """
 
-import json
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -25,6 +23,8 @@ from mover.geometry.camera import tilted
 from mover.geometry.raster import first_hit
 from mover.geometry.rle import encode, tight_box
 from mover.geometry.rotations import rot_y
+from mover.io.files.fields import read_json
+from mover_bench.datasets.true_boxes import FACES, SIGNS
 
 WIDTH, HEIGHT, ROWS, FPS = 1920, 1080, 368, 5.0
 JOINTS = (
@@ -39,11 +39,7 @@ HALPE = {
 FEWEST_PIXELS = 400  # objects that show fewer are not annotated
 LEG = 0.05  # [m], thickness of the legs that bare table tops get
 SAME_FLOOR = 0.1  # [m] above the lowest object
-CORNERS = torch.tensor([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-FACES = torch.tensor([
-    [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-    [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
-])  # fmt: skip
+CORNERS, TRIANGLES = torch.from_numpy(SIGNS).float() / 2, torch.from_numpy(FACES)
 PEAK = 0.1  # confidences that stay below are peaks of heat maps
 
 
@@ -59,7 +55,7 @@ class Part:
 
     def mesh(self) -> Mesh:
         """The box as a mesh in camera axes [m]."""
-        return Mesh(CORNERS * self.size @ self.axes.mT + self.centre, FACES)
+        return Mesh(CORNERS * self.size @ self.axes.mT + self.centre, TRIANGLES)
 
     def upright(self) -> int:
         """Which of its axes is vertical."""
@@ -89,7 +85,7 @@ def read_i3db(folder: Path) -> I3dbScene:
     found = sorted(folder.glob("skel_*_2d_00.json"))
     if not truths or not found:
         raise InputError(f"{folder}: has no gt/skel_*_GT_objects or skel_*_2d_00.json of i3DB")
-    K = torch.tensor(_json(folder / "intrinsics.json"), dtype=torch.float32)[:3, :3]
+    K = torch.tensor(read_json(folder / "intrinsics.json").value, dtype=torch.float32)[:3, :3]
     objects = parts_in(truths[0])
     up = up_of(objects)
     R = tilted(up[2].asin(), torch.atan2(-up[0], -up[1]))
@@ -116,13 +112,6 @@ def read_i3db(folder: Path) -> I3dbScene:
     return I3dbScene(folder.name, truth, detections, keypoints_in(found[0]), imapper)
 
 
-def _json(path: Path) -> Any:  # noqa: ANN401
-    try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as JSON ({error})") from error
-
-
 def parts_in(folder: Path) -> dict[tuple[int, str], list[Part]]:
     """The parts of each object, by its number and category."""
     objects: dict[tuple[int, str], list[Part]] = {}
@@ -130,7 +119,7 @@ def parts_in(folder: Path) -> dict[tuple[int, str], list[Part]]:
         name = re.fullmatch(r"(\d+)_([a-z]+)_(.+)", path.stem)
         if name is None:
             raise InputError(f"{path}: expected a name like 00_chair_seat.json")
-        data = _json(path)
+        data = read_json(path).value
         axes, centre, size = (
             torch.tensor(np.asarray(data[key], np.float32))
             for key in ("axes", "centroid", "scales")
@@ -224,7 +213,7 @@ def visible_masks(objects: dict[tuple[int, str], list[Part]], camera: Camera) ->
 
 def keypoints_in(path: Path) -> Keypoints:
     """The real network's joints of every other frame [px]."""
-    data = _json(path)
+    data = read_json(path).value
     frames = sorted(int(key) for key in data["3d"])
     values = data["confidence"]
     confidence = dict(zip(values["frame_ids"], values["values"], strict=True))

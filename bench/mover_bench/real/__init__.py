@@ -1,1 +1,0 @@
-"""Real recordings with truth that others measured."""
