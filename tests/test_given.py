@@ -135,8 +135,10 @@ def test_walls_that_are_seen_give_the_axis_better_than_rough_yaws():
     assert math.remainder(float(seen.axis[0]) - 0.1, math.pi / 2) == pytest.approx(0, abs=0.03)
     assert float(seen.sharpness[0]) > float(alone.sharpness[0])
     observed = [(yaw, math.radians(2), 0.9) for yaw in (0.6, 0.61, 0.59, 0.6, 0.6)]  # all disagree
-    many, wall = (torch.tensor(x).unbind(-1) for x in (observed, [(0.1, math.radians(0.5), 0.95)]))
-    assert room_axis([many, wall])[0] == pytest.approx(0.6, abs=0.02)
+    many = tuple(torch.tensor(row) for row in zip(*observed, strict=True))
+    wall = tuple(torch.tensor([x]) for x in (0.1, math.radians(0.5), 0.95))
+    axis = [(yaw, spread, chance) for yaw, spread, chance in (many, wall)]
+    assert room_axis(axis)[0] == pytest.approx(0.6, abs=0.02)
 
 
 def test_of_a_room_without_a_guess_the_axis_alone_costs():

@@ -297,7 +297,11 @@ def test_a_capture_keeps_what_it_says_of_its_lens(small_room, tmp_path):
     write_capture(guessed, tmp_path / "guessed")
     assert read_capture(tmp_path / "guessed").focal_spread == 0.055
     write_capture(small_room.capture, tmp_path / "silent")
-    assert read_capture(tmp_path / "silent").focal_spread is None
+    silent = read_capture(tmp_path / "silent")
+    assert silent.focal_spread is None
+    assert not silent.focal_by_lines
+    write_capture(dataclasses.replace(guessed, focal_by_lines=True), tmp_path / "by lines")
+    assert read_capture(tmp_path / "by lines").focal_by_lines
 
 
 @pytest.mark.slow
@@ -312,5 +316,7 @@ def test_a_room_under_a_guessed_lens_is_rebuilt_under_a_better_one(small_room, t
     for piece, own in zip(room.initial.objects, guessed.scene.objects, strict=True):
         assert torch.equal(piece.t_world_object, own.t_world_object)
     stated = dataclasses.replace(guessed, focal_spread=0.0)
-    kept = reconstruct(stated, config, Run(tmp_path / "kept"))
-    assert torch.equal(kept.scene.camera.K, guessed.scene.camera.K)
+    counted = dataclasses.replace(guessed, focal_by_lines=True)
+    for name, capture in (("kept", stated), ("counted", counted)):
+        kept = reconstruct(capture, config, Run(tmp_path / name))
+        assert torch.equal(kept.scene.camera.K, guessed.scene.camera.K)

@@ -26,7 +26,9 @@ from mover.perceive.mediapipe import (
     pose_inputs,
     refined,
     without_furniture,
+    without_room,
 )
+from mover.perceive.reference import Clean
 from mover.perceive.video import Clip, read_frames, write_jpeg
 
 CLIPS = Path(__file__).parents[2] / "shared" / "data" / "clips"
@@ -45,7 +47,7 @@ def detector(picture: np.ndarray) -> dict[tuple[int, ...], np.ndarray]:
     assert picture.min() >= -1
     assert picture.max() <= 1
     scores, values = np.full((2254, 1), -50.0), np.zeros((2254, 12))
-    anchors = mediapipe._anchors() * 224
+    anchors = mediapipe.anchors() * 224
     scale = 224 / W
     for x, y in PEOPLE:
         at = np.array([x, y + (W - H) / 2]) * scale
@@ -133,6 +135,36 @@ def test_masks_lose_the_furniture_that_no_limb_is_near_to():
     assert bool(found[220, 300])  # what is no furniture stays
     none = without_furniture(poses, torch.zeros(H, W, dtype=torch.bool))
     assert none.masks.counts == masks.counts
+
+
+def test_landmarks_where_a_frame_shows_the_empty_room_are_not_seen(tmp_path: Path):
+    """The 33 landmarks of a man: most on him, a leg's on a chair, a toe's on the floor beside."""
+    noise = np.random.default_rng(0).integers(-3, 4, (H, W, 3))
+    room = np.full((H, W, 3), 90)
+    room[130:220, 200:260] = 160  # a chair
+    frame = room + noise + 6  # it became lighter
+    frame[10:228, 140:180] = 30
+    frame[190:205, 225:240] = 30  # a foot before the chair
+    write_jpeg(frame.astype(np.uint8), tmp_path / "000000.jpg")
+    points = torch.full((1, 33, 2), 160.0)
+    points[0, :, 1] = torch.linspace(25, 215, 33)
+    points[0, 25], points[0, 27], points[0, 28], points[0, 31] = torch.tensor(
+        [[215.0, 150], [215, 200], [232, 197], [290, 225]]
+    )
+    points[0, 1] = torch.tensor([-20.0, 50])  # outside nothing is known
+    poses = Poses(
+        Masks(H, W, (encode(torch.ones(H, W, dtype=torch.bool)),)), points, torch.ones(1, 33),
+        torch.tensor([0]), torch.tensor([0]),
+    )  # fmt: skip
+    clip = Clip(str(tmp_path), W, H, torch.zeros(1), None)
+    chair = torch.zeros(H, W, dtype=torch.bool)
+    chair[130:220, 200:260] = True
+    clean = Clean(torch.from_numpy(room).float() / 255, chair)  # always under the man's mask
+    for furniture, gone in ((chair, [25, 27, 31]), (None, [31])):
+        found = without_room(poses, clip, clean, furniture)
+        assert (found.confidence[0] == 0).nonzero()[:, 0].tolist() == gone
+    shown = Clean(torch.from_numpy(frame).float() / 255, torch.zeros_like(chair))
+    assert torch.equal(without_room(poses, clip, shown, chair).confidence, poses.confidence)
 
 
 def test_nothing_is_found_in_an_empty_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -5,6 +5,7 @@ import re
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,8 +35,8 @@ from mover.geometry.rle import decode, tight_box
 from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.scene_file import read_scene
 from mover.io.people.keypoints import read_keypoints
-from mover.perceive import capture as capture_of_video
-from mover.perceive.capture import Video, perceive, read_picture_of
+from mover.perceive import mediapipe
+from mover.perceive.capture import Finders, Video, perceive, read_picture_of
 from mover.perceive.config import FramesConfig, Lens, PerceiveConfig
 from mover.perceive.mediapipe import PoseInputs, Poses
 from mover.perceive.networks import DetectInputs, Finds, link_people
@@ -54,7 +55,7 @@ def perceived(source: Path, out: Path, fps: float = 5.0, lens: Path | None = Non
     return out
 
 
-def rows(capture: Path, name: str) -> list[dict]:
+def rows(capture: Path, name: str) -> list[dict[str, Any]]:
     return json.loads((capture / name).read_text())["annotations"]
 
 
@@ -187,9 +188,7 @@ def test_without_a_network_for_furniture_all_else_is_written_and_the_outlines_ar
     """And MediaPipe's masks and joints, or a command's joints, are all that is needed of people."""
     filmed(tmp_path / "v.mp4", Shot(), range(0, SECOND, 3))
 
-    monkeypatch.setattr(
-        capture_of_video, "pose_inputs", lambda clip: PoseInputs(clip, ("", ""), "")
-    )
+    monkeypatch.setattr(mediapipe, "pose_inputs", lambda clip: PoseInputs(clip, ("", ""), ""))
 
     def poses(inputs: PoseInputs, _config: None, _observe: Observer = silent) -> Poses:
         frames = tuple(range(len(inputs.clip.time)))
@@ -299,7 +298,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(PRESETS, "robust", light("robust"))
 
 
-def room_of(args: VideoArgs, finders=FINDERS) -> Scene:
+def room_of(args: VideoArgs, finders: Finders = FINDERS) -> Scene:
     video_to_room(args, finders)
     assert (args.out / "room" / "report.html").is_file()
     return read_scene(args.out / "room" / "scene.json")

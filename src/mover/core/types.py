@@ -260,6 +260,8 @@ class Capture:
     focal_spread: float | None = None
     """Standard deviation of the logarithm of the focal length; 0: it was measured. None:
     unknown."""
+    focal_by_lines: bool = False
+    """Whether the lines of the reference picture have been counted in the focal length."""
     tilt: Tilt | None = None
     """Of the camera, where it was looked for in the picture."""
     heading: Heading | None = None

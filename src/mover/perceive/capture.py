@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from mover.bodies.keypoints import LAYOUTS
 from mover.core.errors import InputError
@@ -35,26 +37,11 @@ from mover.io.files.cameras import guessed_view, of_view, read_camera_file, with
 from mover.io.files.fields import At, get, maybe, number, read_json, write_json
 from mover.io.files.images import find_depth_file, opened, read_depth, reference_frame, write_image
 from mover.io.people.keypoints import write_keypoints
+from mover.perceive import mediapipe, networks
 from mover.perceive.config import Lens, ModelsConfig, PerceiveConfig
 from mover.perceive.layout import FirstScene, Picture
-from mover.perceive.mediapipe import (
-    PoseInputs,
-    Poses,
-    find_poses,
-    pose_inputs,
-    poses_to_keypoints,
-    without_furniture,
-)
-from mover.perceive.networks import (
-    DetectInputs,
-    Finds,
-    JointsInputs,
-    Tracks,
-    find_instances,
-    find_joints,
-    joined_finds,
-    link_people,
-)
+from mover.perceive.mediapipe import PoseInputs, Poses, find_poses
+from mover.perceive.networks import DetectInputs, Finds, JointsInputs, Tracks
 from mover.perceive.own import Own, own_keypoints, own_masks, own_objects, same_people
 from mover.perceive.reference import Clean, clip_of_clean, detections_in, hidden_mask, reference_of
 from mover.perceive.steady import Drift, SteadyInputs, find_drift, steady_frames, warnings_of
@@ -74,6 +61,7 @@ ASSUMED = 0.15  # cameras of phones and rooms are 50 to 75 degrees wide
 FULL_FRAME = math.hypot(36, 24)  # [mm], diagonal to which "equivalent" focal lengths refer
 SAME_FORMAT = 0.01  # difference of two ratios of width and height
 GUESS = "perceived/guess.json"  # the camera before a first scene, and as it left it
+LENS_FIELDS = ("height", "focal_spread", "focal_by_lines")  # of camera.json, beside the camera
 SAME_TILT = 1e-6  # elements of a rotation that was read back
 TILT = math.radians(8)  # of a camera on a shelf, before anything is seen of it
 CLEARLY = 2.0  # standard deviations by which lines contradict a lens before any body is seen
@@ -86,8 +74,8 @@ Say = Callable[[str], None]
 class Finders:
     """Stages that look at pictures: the networks, or what stands for them."""
 
-    instances: Callable[[DetectInputs, PerceiveConfig, Observer], Finds] = find_instances
-    joints: Callable[[JointsInputs, ModelsConfig, Observer], Keypoints] = find_joints
+    instances: Callable[[DetectInputs, PerceiveConfig, Observer], Finds] = networks.find_instances
+    joints: Callable[[JointsInputs, ModelsConfig, Observer], Keypoints] = networks.find_joints
     poses: Callable[[PoseInputs, None, Observer], Poses] = find_poses
 
 
@@ -114,7 +102,7 @@ def perceive(
     at, text = lens_of((clip.width, clip.height), video.lens)
     if text is not None:
         say(f"warning: {text}")
-    camera, spread = camera_of(at), at.value.get("focal_spread")
+    camera = camera_of(at)
     clean = reference_of(clip, drift, tracks)
     lacking: InputError | None = None
     try:
@@ -125,13 +113,13 @@ def perceive(
     except InputError as error:  # all else is written
         objects, lacking = None, error
         (out / "objects.json").unlink(missing_ok=True)  # of another video
-    if objects is not None and poses is not None:
-        furniture = detections_of(At(objects, "objects.json"), camera, log.warning)
-        outlines = [decode(d.mask, 0) for d in furniture if d.mask is not None]
-        if outlines:
-            less = without_furniture(poses, torch.stack(outlines).any(0))
-            tracks = replace(tracks, masks=less.masks)
-        clean = reference_of(clip, drift, tracks)
+    if poses is not None:
+        outlines = outlined(objects, camera)
+        poses = mediapipe.without_room(poses, clip, clean, outlines)
+        joints = mediapipe.poses_to_keypoints(poses, clip.fps)
+        if outlines is not None:
+            tracks = replace(tracks, masks=mediapipe.without_furniture(poses, outlines).masks)
+            clean = reference_of(clip, drift, tracks)
     unseen = 100 * float(clean.hidden.float().mean())
     count = len(tracks.person.unique())
     say(
@@ -139,10 +127,9 @@ def perceive(
         "without a person"
     )
     write_image(clean.picture, out / "reference.png")
-    camera, spread = lens_by_lines(camera, spread, clean, say)
-    known = {"height": at.value.get("height"), "focal_spread": spread}
-    known = {name: value for name, value in known.items() if value is not None}
-    write_json({**camera_to_json(camera), **known}, out / "camera.json")
+    given = {name: at.value[name] for name in LENS_FIELDS if at.value.get(name) is not None}
+    camera, by_lines = lens_by_lines(camera, given.get("focal_spread"), clean, say)
+    write_json({**camera_to_json(camera), **given, **by_lines}, out / "camera.json")
     people = None
     if tracks.masks.counts:
         people = People(tracks.masks, clip.numbers[tracks.frame], tracks.person, {})
@@ -155,6 +142,15 @@ def perceive(
     if lacking is not None:
         raise lacking
     write_json(objects, out / "objects.json")
+
+
+def outlined(objects: dict[str, Any] | None, camera: Camera) -> Bool[Tensor, "h w"] | None:
+    """Where the furniture of objects.json is; None: nothing of it has an outline."""
+    if objects is None:
+        return None
+    furniture = detections_of(At(objects, "objects.json"), camera, log.warning)
+    masks = [decode(d.mask, 0) for d in furniture if d.mask is not None]
+    return torch.stack(masks).any(0) if masks else None
 
 
 def moving_people(
@@ -220,8 +216,8 @@ def people_of_clip(
     joints = own_keypoints(own, clip, drift, say)
     poses = None
     if own.mediapipe:
-        poses = run.stage(finders.poses, pose_inputs(clip), None)
-        joints = poses_to_keypoints(poses, clip.fps)
+        poses = run.stage(finders.poses, mediapipe.pose_inputs(clip), None)
+        joints = mediapipe.poses_to_keypoints(poses, clip.fps)
     if own.masks is not None:
         tracks, poses = own_masks(own.masks, clip, drift, say), None
     elif poses is not None:
@@ -230,7 +226,7 @@ def people_of_clip(
         count = len(clip.time)
         chunks = [tuple(range(k, min(k + CHUNK, count))) for k in range(0, count, CHUNK)]
         found = [run.stage(finders.instances, DetectInputs(clip, c), config) for c in chunks]
-        tracks = link_people(joined_finds(found))
+        tracks = networks.link_people(networks.joined_finds(found))
     if joints is None and config.models.keypoints and tracks.masks.counts:
         joints = run.stage(finders.joints, JointsInputs(clip, tracks), config.models)
     if joints is not None and not (own.keypoints is None and own.masks is None):
@@ -259,23 +255,23 @@ def furniture_in(
 
 def lens_by_lines(
     camera: Camera, spread: float | None, clean: Clean, say: Say
-) -> tuple[Camera, float | None]:
+) -> tuple[Camera, dict[str, Any]]:
     """The camera with the focal length of the picture's own lines, if the given one is a guess.
 
-    Bodies are fitted under it, so it counts before they are. What it leaves open is handed on: in
-    the room the feet constrain it, too.
+    Bodies are fitted under it, so it counts before they are. What it leaves open is handed on, with
+    the fact that the lines are in it: counted again in the room, they would count twice.
     """
     if not spread:
-        return camera, spread
+        return camera, {}
     segments = find_segments(clean.picture, clean.hidden, camera.K[:2, 2])
     found = find_lens(LensInputs(segments, camera, spread, TILT), LensConfig())
     if abs(math.log(found.zoom)) < CLEARLY * found.spread:  # the feet will say more
-        return camera, spread
+        return camera, {}
     say(
         f"lens: the lines of the picture show a focal length {100 * (found.zoom - 1):+.1f} ± "
         f"{100 * found.spread:.1f} % of the guess; it is taken (--camera FILE keeps a measured one)"
     )
-    return zoomed(camera, found.zoom), found.spread
+    return zoomed(camera, found.zoom), {"focal_spread": found.spread, "focal_by_lines": True}
 
 
 def lens_of(size: tuple[int, int], lens: Lens) -> tuple[At, str | None]:
@@ -395,17 +391,11 @@ def _guessed(folder: Path, camera: Camera) -> Camera:
 
 
 def write_first_scene(first: FirstScene, folder: Path, guess: Camera) -> None:
-    """Write scene.json with its meshes, the tilt into camera.json, and what else is possible.
-
-    Args:
-        first: What was found.
-        folder: The capture.
-        guess: The camera with which it began.
-    """
+    """Write scene.json with its meshes, and the tilt that `guess` had not, into a capture."""
     write_scene(first.scene, folder / "scene.json")
     parts = folder_parts(folder)
     assert parts.camera is not None
-    given = {k: v for k, v in parts.camera.value.items() if k in ("height", "focal_spread")}
+    given = {k: v for k, v in parts.camera.value.items() if k in LENS_FIELDS}
     found = camera_to_json(first.scene.camera)
     write_json({**found, **given}, folder / "camera.json")
     write_json({"before": camera_to_json(guess), "found": found}, folder / GUESS)

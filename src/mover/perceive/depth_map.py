@@ -28,14 +28,7 @@ def median_depths(
 def range_in(
     depth: Float[Tensor, "h w"], cues: ImageCues, camera: Camera, slack: float
 ) -> DepthRange:
-    """Bounds on the front surfaces within the masks: the measured depth and its error.
-
-    Args:
-        depth: Measured [m]; NaN: unknown.
-        cues: The windows.
-        camera: Of the picture.
-        slack: Error of the depth [share].
-    """
+    """Bounds on the front surfaces in the masks: measured depth [m; NaN: unknown], -+ `slack`."""
     count = len(cues.boxes)
     images = sample_nearest(depth.nan_to_num(0.0), cues.views, camera.K, 0.0)
     known = (images > 0) & (cues.masks > 0.5)
@@ -50,10 +43,7 @@ def floor_height(
 ) -> float | None:
     """Height of the camera above the lowest level surface of the picture [m]; None: there is none.
 
-    Args:
-        depth: Measured [m].
-        camera: With its tilt.
-        things: Where furniture and people are; they are left out.
+    Furniture and people (`things`) are left out.
     """
     step = max(1, camera.width // 320)
     rows, columns = torch.arange(0, camera.height, step), torch.arange(0, camera.width, step)

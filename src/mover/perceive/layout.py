@@ -40,11 +40,7 @@ from mover.stages.objects.gather_given import given_axis, sizes_of_shapes, unpla
 from mover.stages.objects.own_edges import own_edges
 from mover.stages.objects.place_inputs import PlaceInputs
 from mover.stages.objects.place_objects import place_objects
-from mover.stages.objects.prepare_objects import (
-    PrepareInputs,
-    prepare_objects,
-    to_objects,
-)
+from mover.stages.objects.prepare_objects import PrepareInputs, prepare_objects, to_objects
 from mover.stages.posterior import Gaussian
 
 OTHER_SIZES: dict[str, tuple[float, float, float]] = {
@@ -89,11 +85,7 @@ def is_placed(category: str) -> bool:
 def shapes_of(category: str, count: int, folder: Path | None = None) -> tuple[ShapeChoice, ...]:
     """At most `count` shapes of a class that differ most in size and design.
 
-    Args:
-        category: Free text.
-        count: Most shapes.
-        folder: The user's meshes, named after their class: `chair_0.obj`; they come before the
-            library's.
+    The user's meshes, named after their class (FOLDER/chair_0.obj), come before the library's.
 
     Raises:
         InputError: If a mesh cannot be read.
@@ -213,14 +205,7 @@ class FirstScene:
 def first_scene(
     picture: Picture, config: LayoutConfig, run: Run, meshes: Path | None = None
 ) -> FirstScene:
-    """Place library furniture where a picture shows furniture.
-
-    Args:
-        picture: Detections in one picture.
-        config: How.
-        run: Keeps what is finished.
-        meshes: The user's own shapes.
-    """
+    """Place furniture of the library, or of the folder `meshes`, where a picture shows some."""
     placed = [k for k, d in enumerate(picture.detections) if is_placed(d.category)]
     skipped = tuple(d.category for k, d in enumerate(picture.detections) if k not in placed)
     if not placed:

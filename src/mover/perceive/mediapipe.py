@@ -33,6 +33,7 @@ from mover.geometry.rle import decode, encode
 from mover.io.people.found import followed
 from mover.perceive import weights
 from mover.perceive.needs import install
+from mover.perceive.reference import Clean
 from mover.perceive.video import Clip, read_picture
 
 LAYOUT = "mediapipe33"
@@ -44,11 +45,11 @@ KERNEL = 7  # cells of a map about a landmark
 LIKELY = 0.5  # least maximum of a map that moves a landmark
 INSIDE = 0.5  # least coverage of a mask
 TWICE = 0.7  # overlap of two masks, over the smaller one, from which they are one person
+NOISE = 5.0  # times the median difference of a frame from the room: what differs less is the room
+PATCH, EMPTY = 0.02, 0.75  # of the height: half a square; share of it that looks like the room
 SIZES = 224, 256  # [px], of the pictures that the networks see
 
 Array = NDArray[np.floating[Any]]
-
-
 Runs = Callable[[Array], dict[tuple[int, ...], Array]]
 """A network that is ready: a picture (h, w, 3) in, an array for the shape of each output out."""
 
@@ -164,8 +165,8 @@ def detected(picture: NDArray[np.uint8], detector: Runs) -> list[tuple[Array, Ar
     score = expit(out[1, 2254, 1][0, :, 0])
     sure = score >= SEEN
     values = out[1, 2254, 12][0, sure].reshape(-1, 6, 2)  # middle, size, four points
-    anchors = _anchors()[sure] * SIZES[0]
-    values = values + np.where(np.arange(6)[:, None] == 1, 0, anchors[:, None])
+    boxes = anchors()[sure] * SIZES[0]
+    values = values + np.where(np.arange(6)[:, None] == 1, 0, boxes[:, None])
     found: list[tuple[Array, Array]] = []
     left = np.argsort(-score[sure], kind="stable")
     while len(left):
@@ -182,7 +183,7 @@ def detected(picture: NDArray[np.uint8], detector: Runs) -> list[tuple[Array, Ar
 
 
 @lru_cache(maxsize=1)
-def _anchors() -> Array:
+def anchors() -> Array:
     """Middles of the detector's boxes in the picture, from 0 to 1 (Liu et al., SSD)."""
     rows: list[Array] = []
     for cells, boxes in CELLS:
@@ -194,15 +195,9 @@ def _anchors() -> Array:
 def cropped(
     picture: NDArray[np.uint8], middle: Array, side: float, turn: float, size: int, border: int
 ) -> tuple[Array, Array]:
-    """A turned square of a picture, and the matrix (2, 3) from its pixels to the picture's.
+    """A square of a picture, turned clockwise [rad], and the matrix (2, 3) to the picture from it.
 
-    Args:
-        picture: In bytes.
-        middle: Of the square [px].
-        side: Its length [px].
-        turn: Of its x axis, clockwise [rad].
-        size: Pixels along its sides.
-        border: What OpenCV puts where the picture ends.
+    `middle` and `side` are in pixels of the picture; OpenCV's `border` is where the picture ends.
     """
     import cv2
 
@@ -214,12 +209,7 @@ def cropped(
 
 
 def refined(places: Array, maps: Array) -> Array:
-    """Landmarks [px of the crop] at the mean of their map about them, where it is sure.
-
-    Args:
-        places: Of the landmarks.
-        maps: (cells, cells, landmarks), logits.
-    """
+    """Landmarks [px of the crop] at the mean of their map (cells, cells, landmarks; logits)."""
     from scipy.special import expit
 
     cells, half = len(maps), KERNEL // 2
@@ -248,22 +238,54 @@ BONES = ((11, 23, 0.3), (12, 24, 0.3), (23, 25, 0.245), (24, 26, 0.245), (25, 27
 """Pairs of landmarks, and how far apart they are [of the height] (Drillis & Contini 1966)."""
 
 
+def without_room(
+    poses: Poses, clip: Clip, clean: Clean, furniture: Bool[Tensor, "h w"] | None
+) -> Poses:
+    """The landmarks without confidence where their frame shows the room as it is without people.
+
+    A network takes the legs of a chair for those of the person in front of them, and is as sure
+    as of any other. Where most of a person looks like the room, the room has a person in it. Of
+    hidden pixels nothing is known, unless there is an outline of furniture.
+    """
+    import cv2
+
+    known = ~clean.hidden if furniture is None else ~clean.hidden | furniture
+    confidence = poses.confidence.clone()
+    for frame in poses.frame.unique().tolist():
+        picture = torch.from_numpy(read_picture(clip.path(frame))).float() / 255
+        off = picture - clean.picture
+        off = (off - off.flatten(0, 1).median(0).values).abs()  # the light may change
+        same = (off.amax(-1) < NOISE * off.median().clamp_min(1 / 255)) & known
+        for row in (poses.frame == frame).nonzero()[:, 0].tolist():
+            points = poses.points[row]
+            reach = max(2, round(PATCH * float((points.amax(0) - points.amin(0)).amax())))
+            share = cv2.blur(same.float().numpy(), (2 * reach + 1, 2 * reach + 1))
+            inside = (points >= 0) & (points < torch.tensor([clip.width, clip.height]))
+            empty = inside.all(-1)
+            x, y = points[empty].long().unbind(-1)
+            empty[empty.clone()] = torch.from_numpy(share)[y, x] > EMPTY
+            if 2 * int(empty.sum()) < len(points):
+                confidence[row, empty] = 0
+    return replace(poses, confidence=confidence)
+
+
 def without_furniture(poses: Poses, furniture: Bool[Tensor, "h w"], margin: float = 1.25) -> Poses:
     """The masks without what they swallow of the furniture: all of it that no limb is near to.
 
-    Args:
-        poses: People in frames.
-        furniture: Where furniture is seen in the clean picture.
-        margin: On how far skin and clothes reach.
+    `margin` is a factor on how far skin and clothes reach.
     """
     import cv2
 
     kept = list[bytes]()
+    seen = poses.confidence > 0
     for row, points in enumerate(poses.points.double().numpy()):
         tall = max(np.linalg.norm(points[a] - points[b]) / share for a, b, share in BONES)
         near = np.zeros(furniture.shape, np.uint8)
-        for chain, reach in LIMBS:
-            line = points[list(chain)].round().astype(np.int32)[None]
+        for limb, reach in LIMBS:
+            chain = [k for k in limb if seen[row, k]]
+            if len(chain) < 2:
+                continue
+            line = points[chain].round().astype(np.int32)[None]
             width = max(1, round(2 * margin * reach * tall))
             cv2.polylines(near, line, isClosed=False, color=1, thickness=width)
             if chain[0] == chain[-1]:

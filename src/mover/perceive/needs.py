@@ -41,13 +41,7 @@ def install(extra: str) -> str:
 def missing(
     models: ModelsConfig, kinds: Sequence[str] = NETWORKS, *, mediapipe: bool = False
 ) -> list[str]:
-    """A sentence for each thing that a video needs and this machine lacks; empty: all is there.
-
-    Args:
-        models: The networks.
-        kinds: Which of them are used.
-        mediapipe: Whether MediaPipe's are used.
-    """
+    """A sentence for each thing that a video needs and this machine lacks; empty: all is there."""
     kinds = [kind for kind in kinds if getattr(models, kind)]
     extra = "perceive" if kinds else "mediapipe"
     packages = ["av", *(["transformers"] if kinds else [])]

@@ -76,9 +76,6 @@ def _loaded(kind: str, name: str) -> Network:
     return Network(model.to(device).eval(), processor, device)
 
 
-# Instances.
-
-
 @record
 class DetectInputs:
     """Pictures of a clip."""
@@ -119,15 +116,7 @@ def find_instances(
 def instances(
     net: Network, pictures: Sequence[Any], frames: Sequence[int], score: float, least: float = LEAST
 ) -> Finds:
-    """What the network sees in a batch of pictures of one size.
-
-    Args:
-        net: Mask2Former or MaskFormer.
-        pictures: In bytes.
-        frames: Their numbers.
-        score: Least score.
-        least: Smallest instance, as a share of the picture.
-    """
+    """What Mask2Former or MaskFormer sees in pictures of a size; `least` is a share of its area."""
     inputs = net.processor(images=list(pictures), return_tensors="pt").to(net.device)
     with torch.inference_mode():
         outputs = net.model(**inputs)
@@ -178,9 +167,6 @@ def overlap(a: Bool[Tensor, "n h w"], b: Bool[Tensor, "m h w"]) -> Float[Tensor,
     return shared / (flat[0].sum(1)[:, None] + flat[1].sum(1)[None] - shared).clamp_min(1)
 
 
-# People through the video.
-
-
 @record
 class Tracks:
     """People's masks, one row for each (frame, person)."""
@@ -199,9 +185,6 @@ def link_people(found: Finds) -> Tracks:
     frames, size = found.frame[kept], np.linalg.norm(high - low, axis=1)
     person = followed(frames.tolist(), (low + high) / 2, size)
     return Tracks(people, frames, torch.from_numpy(person))
-
-
-# Joints.
 
 
 @record

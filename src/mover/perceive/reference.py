@@ -42,12 +42,7 @@ def reference_of(clip: Clip, drift: Drift, tracks: Tracks) -> Clean:
     """The room without people: the median of the frames that show a pixel empty.
 
     A person without a mask for some frames is in no median. Where too few frames show a pixel, it
-    is that of the frame which shows most of the room.
-
-    Args:
-        clip: Steadied.
-        drift: What was undone.
-        tracks: People.
+    is that of the frame which shows most of the room. `drift` is what was undone in the clip.
     """
     size = clip.height, clip.width
     chosen = np.linspace(0, len(clip.time) - 1, min(len(clip.time), FRAMES)).round().astype(int)

@@ -34,13 +34,7 @@ GUESSED = AlignConfig(tilt_prior=PITCH)  # a camera of unknown tilt looks anywhe
 
 
 def seen_from(picture: Picture, bodies: Bodies | None, run: Run) -> Picture:
-    """The picture with the camera and heading of the room by feet and by its own edges.
-
-    Args:
-        picture: Its camera is a guess.
-        bodies: Of the people; None: there are none.
-        run: Keeps what is finished.
-    """
+    """The picture with the camera and heading of the room by feet and by its own edges."""
     by_feet = picture if bodies is None else standing_on(picture, bodies, run)
     found = along_edges(by_feet)
     if bodies is None or found.tilt_spread is None:
@@ -49,11 +43,7 @@ def seen_from(picture: Picture, bodies: Bodies | None, run: Run) -> Picture:
 
 
 def along_edges(picture: Picture) -> Picture:
-    """The picture with the tilt of its camera and the room's heading, where its edges show them.
-
-    Args:
-        picture: Its focal length counts as known.
-    """
+    """The picture with tilt and heading where its edges show them; its focal length is trusted."""
     camera = picture.camera
     if picture.reference is None:
         return picture
@@ -75,10 +65,7 @@ def along_edges(picture: Picture) -> Picture:
 def standing_on(picture: Picture, bodies: Bodies, run: Run) -> Picture:
     """The picture with the camera that the feet of people constrain, and how well they do.
 
-    Args:
-        picture: Its camera is a guess.
-        bodies: In camera axes; in world axes they say nothing that is not known.
-        run: Keeps what is finished.
+    Bodies in world axes say nothing that is not known.
     """
     if bodies.space != "camera":
         return picture
@@ -101,12 +88,8 @@ def standing_on(picture: Picture, bodies: Bodies, run: Run) -> Picture:
 def camera_prior(found: Alignment, picture: Picture, size: float) -> Gaussian:
     """The camera of the feet, with the errors that all of them share, and usual cameras.
 
-    A hundred feet err together: by the lean of all poses, and by the size of the people.
-
-    Args:
-        found: By the feet alone.
-        picture: Its camera before, with its tilt where the lines show it.
-        size: Standard deviation of the logarithm of the people's size.
+    A hundred feet err together: by the lean of all poses, and by the size of the people (`size` is
+    the standard deviation of its logarithm).
     """
     height = -found.ground
     to_log = torch.tensor([1.0, 1.0, -1 / height], dtype=torch.float64)

@@ -115,12 +115,9 @@ def moved(H: Matrix, points: Matrix) -> Matrix:
 
 
 def warp(picture: NDArray[Any], H: Matrix, size: tuple[int, ...]) -> NDArray[Any]:
-    """The picture seen in the pixels of the reference; its border goes on where it ends.
+    """The picture in the pixels of the reference (height, width); its border goes on where it ends.
 
-    Args:
-        picture: What is sampled.
-        H: Its pixels from those of the reference.
-        size: Height and width of the reference [px].
+    H gives its pixels from those of the reference.
     """
     import cv2
 
@@ -201,13 +198,7 @@ def first_cut(agree: Sequence[float]) -> int | None:
 
 
 def _judged(from_first: Matrix, agree: list[float], size: tuple[int, int]) -> Drift:
-    """Choose the reference frame and say what the camera did.
-
-    Args:
-        from_first: Pixels of each frame from pixels of the first.
-        agree: How well each frame agrees with the first.
-        size: Width and height [px].
-    """
+    """Choose the reference frame and say what the camera did; width and height are in pixels."""
     x, y = np.meshgrid(*(np.linspace(0, n, GRID) for n in size))
     points = np.stack([x.ravel(), y.ravel()], -1)
     places = np.stack([moved(H, points) for H in from_first])
@@ -225,12 +216,7 @@ def _judged(from_first: Matrix, agree: list[float], size: tuple[int, int]) -> Dr
 
 
 def warnings_of(drift: Drift, time: Float[Tensor, " frames"]) -> list[str]:
-    """What a user should know.
-
-    Args:
-        drift: Of the camera.
-        time: Of each frame of the whole video [s].
-    """
+    """What a user should know; `time` is that of each frame of the whole video [s]."""
     found: list[str] = []
     if drift.cuts:
         seconds = [float(time[k]) for k in drift.cuts]

@@ -61,7 +61,8 @@ def through_its_lens(
     capture: Capture, config: Config, run: Run, pinned: tuple[str, ...]
 ) -> Capture:
     """The capture under the focal length and tilt that the lines of its picture constrain."""
-    camera, guessed = capture.scene.camera, bool(capture.focal_spread)
+    stated = 0.0 if capture.focal_by_lines else capture.focal_spread
+    camera, guessed = capture.scene.camera, bool(stated)
     segments = lines_of(capture, config, FINE if guessed else SURE)
     if segments is None:
         return capture
@@ -71,11 +72,11 @@ def through_its_lens(
         spread = people.alignment.covariance.diag()[:2].amax()
         tilt = min(tilt, math.hypot(config.lens.feet, float(spread) ** 0.5))
     by_feet = guessed and people is not None
-    inputs = LensInputs(segments, camera, capture.focal_spread, tilt, by_feet)
+    inputs = LensInputs(segments, camera, stated, tilt, by_feet)
     lens = run.stage(find_lens, inputs, config.lens)
     warnings = (*capture.warnings, *lens.warnings)
     found = replace(capture, warnings=warnings, tilt=lens.tilt, heading=lens.heading)
-    if capture.focal_spread or lens.zoom != 1:
+    if stated or lens.zoom != 1:
         found = replace(found, focal_spread=lens.spread)
     return through_lens(found, lens.zoom, pinned)
 

@@ -76,6 +76,7 @@ def build_capture(parts: Parts) -> Capture:
         path=path,
         depth=None if parts.load_depth is None else parts.load_depth(camera),
         focal_spread=lens.focal_spread,
+        focal_by_lines=lens.focal_by_lines,
     )
     check_plausible(capture, warn)
     return dataclasses.replace(capture, warnings=tuple(warnings))

@@ -24,7 +24,8 @@ LEVEL = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
 class CameraFields(Struct, frozen=True):
     """camera.json, and `camera` of scene.json; lengths in pixels, the height above the floor [m].
 
-    The spread is the standard deviation of the logarithm of the focal length.
+    The spread is the standard deviation of the logarithm of the focal length; `focal_by_lines`
+    says that the lines of the reference picture are in it, so that they do not count again.
     """
 
     w: Side
@@ -36,6 +37,7 @@ class CameraFields(Struct, frozen=True):
     R_cam_world: Rows | None = None
     height: Annotated[float, Meta(ge=0.1, le=20)] | None = None
     focal_spread: Share | None = None
+    focal_by_lines: bool = False
 
 
 def camera_of(at: At, other: Camera | None = None) -> Camera:

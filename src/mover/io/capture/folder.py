@@ -168,6 +168,8 @@ def write_trees(
         camera["height"] = capture.camera_height
     if capture.focal_spread is not None:
         camera["focal_spread"] = capture.focal_spread
+    if capture.focal_by_lines:
+        camera["focal_by_lines"] = True
     write_scene(capture.scene, folder / "scene.json")
     objects = detections_to_json(capture.detections, capture.scene.camera, image)
     write_json(objects, folder / "objects.json")
