@@ -19,7 +19,7 @@ from mover.io.masks.instances import Instances
 
 H, W = 48, 64
 KEPT = (0, 1, 2, 6, 7)
-"""Frames in which somebody is; between them nobody is."""
+"""Frames in which there is a person; between them there is none."""
 
 
 def walker(frame: int, start: int = 4) -> np.ndarray:
@@ -59,7 +59,7 @@ def of_pictures(name: str, soft: bool = False, home: str = "") -> Callable[[Path
 
 
 def results(first: int) -> Callable[[Path], Path]:
-    """A list of detections of COCO without those frames in which there is nobody."""
+    """A list of detections of COCO without those frames in which there is no person."""
 
     def write(folder: Path) -> Path:
         rows = [{"image_id": k + first, "category_id": 1, "score": 0.9,
@@ -179,6 +179,9 @@ def test_people_without_tracks_are_followed_by_place_not_by_score(
 
 
 def test_a_stack_of_frames_is_a_person_and_one_of_apart_masks_are_people(tmp_path: Path) -> None:
+    np.save(tmp_path / "logits.npy", walker(0) * 2.5 - 1.2)
+    (lone,) = pixels(read_people(tmp_path / "logits.npy", {}, None)).values()
+    assert (lone == walker(0)).all()
     np.save(tmp_path / "frames.npy", np.stack([walker(k) for k in range(6)])[:, None])
     got = pixels(read_people(tmp_path / "frames.npy", {}, None))
     assert list(got) == [(k, 0) for k in range(6)]

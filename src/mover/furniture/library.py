@@ -3,13 +3,13 @@
 import difflib
 import re
 from collections.abc import Callable, Iterable
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 
 from mover.core.types import Mesh
 from mover.furniture import seats, storage
-from mover.furniture.pieces import Furniture, block, finish
+from mover.furniture.pieces import Furniture, block, finish, pair
 
 SEEDS = 6  # sizes that are tried of each design
 Size = tuple[float, float, float]
@@ -37,10 +37,9 @@ def choose_piece(category: str, size: Size) -> Mesh:
     kind = canonical(category)
     pieces = catalogue("stool" if kind == "bar stool" else kind)
     if not pieces:
-        low = (-size[0] / 2, 0.0, -size[2] / 2)
-        high = (size[0] / 2, size[1], size[2] / 2)
-        x, y, z = zip(low, high, strict=True)
-        return finish(canonical(category), 0, [block(x, y, z)], top=size[1]).mesh
+        width, height, depth = size
+        box = block(pair(width / 2), (0.0, height), pair(depth / 2))
+        return finish(kind, 0, [box], top=height).mesh
     stretch = [np.log(np.array(size) / np.array(piece.size)) for piece in pieces]
     return pieces[int(np.argmin([float((s * s).sum()) for s in stretch]))].mesh
 
@@ -55,8 +54,8 @@ PIECES: dict[str, Callable[[np.random.Generator, int], Furniture]] = {
     "stool": seats.stool,
     "bench": seats.bench,
     "sofa": seats.sofa,
-    "single bed": seats.single_bed,
-    "double bed": seats.double_bed,
+    "single bed": seats.bed,
+    "double bed": partial(seats.bed, pillows=2),
     "table": storage.table,
     "desk": storage.desk,
     "coffee table": storage.coffee_table,

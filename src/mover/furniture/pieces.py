@@ -77,19 +77,14 @@ def block(x: Span, y: Span, z: Span, bevel: float = 0.0) -> Part:
     return np.concatenate([corners + inward * keep[axis] for axis in range(3)])
 
 
-def post(x: float, z: float, y: Span, half: float) -> Part:
-    """A square bar upright at (x, z), of the thickness 2 * `half` [m]."""
-    return block((x - half, x + half), y, (z - half, z + half))
-
-
 def pair(x: float) -> Span:
     """The same distance to both sides of the middle [m]."""
     return -x, x
 
 
 def posts(xs: Iterable[float], zs: Iterable[float], y: Span, half: float) -> list[Part]:
-    """A `post` at each of the places [m]."""
-    return [post(x, z, y, half) for x in xs for z in zs]
+    """Square bars upright at all pairs (x, z), of the thickness 2 * `half` [m]."""
+    return [block((x - half, x + half), y, (z - half, z + half)) for x in xs for z in zs]
 
 
 def upright(xs: Iterable[float], half: float, y: Span, z: Span) -> list[Part]:

@@ -1,5 +1,6 @@
 """Sofas and beds: what one sits, leans and lies on."""
 
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -36,7 +37,8 @@ def sofa(rng: np.random.Generator, style: int) -> Furniture:
     parts = [block((left + 0.01, right - 0.01), (foot, h - 0.14), (-0.24, d - 0.03), 0.01)]
     parts += _cushions(seats, each, (foot, h, back), d)
     top = h + (0.2 if style == 0 else 0.17)
-    parts += [_arm(s * x, s * (x + arm), (foot, top), d) for s in sides]
+    for inside, outside in (sorted((s * x, s * (x + arm))) for s in sides):
+        parts.append(block((inside, outside), (foot, top), (-0.24, d - 0.01), 0.03))
     front = d
     if style == 3:
         front = d + draw(rng, 0.5, 0.75)
@@ -47,11 +49,6 @@ def sofa(rng: np.random.Generator, style: int) -> Furniture:
         parts += [rod((i, 0, k), (i, foot + 0.03, k), (0.022, 0.028), 8) for i, k in feet]
     usable = (-x, x - each if style == 3 else x)
     return finish("sofa", style, parts, Seat(h, usable, (0.0, d), back))
-
-
-def _arm(inside: float, outside: float, y: tuple[float, float], d: float) -> Part:
-    x = (min(inside, outside), max(inside, outside))
-    return block(x, y, (-0.24, d - 0.01), 0.03)
 
 
 def _cushions(seats: int, each: float, heights: tuple[float, float, float], d: float) -> list[Part]:
@@ -65,23 +62,12 @@ def _cushions(seats: int, each: float, heights: tuple[float, float, float], d: f
     return parts
 
 
-def single_bed(rng: np.random.Generator, style: int) -> Furniture:
-    """A bed for one: see `_bed`."""
-    return _bed("bed", rng, style, draw(rng, 0.9, 1.05), 1)
-
-
-def double_bed(rng: np.random.Generator, style: int) -> Furniture:
-    """A bed for two: see `_bed`."""
-    return _bed("bed", rng, style, draw(rng, 1.4, 1.8), 2)
-
-
-def _bed(
-    category: str, rng: np.random.Generator, style: int, width: float, pillows: int
-) -> Furniture:
-    """0 box with headboard, 1 frame with head and foot boards, 2 low platform.
+def bed(rng: np.random.Generator, style: int, pillows: int = 1) -> Furniture:
+    """A bed for one or two: 0 box with headboard, 1 head and foot boards, 2 low platform.
 
     For detected beds only: 3 planks on legs, 4 head and foot boards of one piece with high legs.
     """
+    width = draw(rng, 0.9, 1.05) if pillows == 1 else draw(rng, 1.4, 1.8)
     length, h = draw(rng, 1.96, 2.05), draw(rng, 0.44, 0.52)
     x, z = width / 2, length / 2
     if style == 2:
@@ -92,7 +78,7 @@ def _bed(
     parts = [mattress, frame]
     if style >= 3:
         length = draw(rng, 1.8, 2.05)
-        return _open_bed(category, (width, h, length), style == 4, draw(rng, 0.8, 1.1), pillows)
+        return _open_bed((width, h, length), style == 4, draw(rng, 0.8, 1.1), pillows)
     if style > 0:
         parts += posts(pair(x - 0.04), pair(z - 0.04), (0, h - 0.15), 0.04)
     board = draw(rng, 0.95, 1.15)
@@ -104,11 +90,11 @@ def _bed(
         ahead = (z + edge - 0.03, z + edge + 0.04)
         parts += _slats((-x - edge, x + edge), (h - 0.15, h + 0.14), ahead)
     parts += _pillows(x, z, h, pillows)
-    return finish(category, style, parts, Seat(h, (-x, x), (-z, z)), top=h)
+    return finish("bed", style, parts, Seat(h, (-x, x), (-z, z)), top=h)
 
 
 def _open_bed(
-    category: str, size: tuple[float, float, float], boards: bool, high: float, pillows: int
+    size: tuple[float, float, float], boards: bool, high: float, pillows: int
 ) -> Furniture:
     """A thin mattress on a thin frame, with nothing but legs below."""
     width, h, length = size
@@ -120,7 +106,7 @@ def _open_bed(
         parts.append(block((-x, x), (h - 0.15, top), (k - 0.03, k + 0.03), 0.01))
         parts += posts(pair(x - 0.03), (k, k), (0, top), 0.03)
     parts += _pillows(x, z, h, pillows)
-    return finish(category, 3 + boards, parts, Seat(h, (-x, x), (-z, z)), top=h)
+    return finish("bed", 3 + boards, parts, Seat(h, (-x, x), (-z, z)), top=h)
 
 
 def _pillows(x: float, z: float, h: float, count: int) -> list[Part]:
@@ -156,10 +142,6 @@ def chair(rng: np.random.Generator, style: int) -> Furniture:
     return finish("chair", style, parts, Seat(h, (-x, x), (-behind + 0.01, z), back))
 
 
-def _panel_back(x: float, h: float, back: float, z: float) -> list[Part]:
-    return [block((-x, x), (h - 0.04, back), (z - 0.03, z), 0.008)]
-
-
 def _ladder_back(x: float, h: float, back: float, z: float) -> list[Part]:
     behind, inner = z - 0.018, pair(x - 0.02)
     bars = [rod((s, h - 0.04, behind), (s, back, behind), (0.018, 0.018)) for s in inner]
@@ -179,10 +161,6 @@ def _spindle_back(x: float, h: float, back: float, z: float) -> list[Part]:
     return [*spindles, block((-x, x), (back - 0.07, back), (z - 0.034, z - 0.002), 0.008)]
 
 
-def _square_legs(x: float, z: float, h: float) -> list[Part]:
-    return legs(x - 0.03, z - 0.03, h - 0.02, 0.028)
-
-
 def _round_legs(x: float, z: float, h: float) -> list[Part]:
     left, right = pair(x - 0.03)
     rungs = [rod((left, 0.2, k), (right, 0.2, k), (0.011, 0.011), 8) for k in pair(z - 0.03)]
@@ -198,12 +176,19 @@ def _side_frames(x: float, z: float, h: float) -> list[Part]:
     return parts
 
 
-def _splayed_legs(x: float, z: float, h: float) -> list[Part]:
-    return legs(x - 0.06, z - 0.06, h - 0.02, 0.02, 0.04)
-
-
-_CHAIR_LEGS = (_square_legs, _round_legs, _side_frames, _splayed_legs)
-_CHAIR_BACKS = (_panel_back, _ladder_back, _low_back, _spindle_back)
+Legs = Callable[[float, float, float], list[Part]]
+_CHAIR_LEGS: tuple[Legs, ...] = (
+    lambda x, z, h: legs(x - 0.03, z - 0.03, h - 0.02, 0.028),
+    _round_legs,
+    _side_frames,
+    lambda x, z, h: legs(x - 0.06, z - 0.06, h - 0.02, 0.02, 0.04),
+)
+_CHAIR_BACKS: tuple[Callable[[float, float, float, float], list[Part]], ...] = (
+    lambda x, h, back, z: [block((-x, x), (h - 0.04, back), (z - 0.03, z), 0.008)],
+    _ladder_back,
+    _low_back,
+    _spindle_back,
+)
 
 
 def armchair(rng: np.random.Generator, style: int) -> Furniture:

@@ -1,6 +1,6 @@
 """Bodies as AMASS and the tools around SMPL-X keep them: one npz a person."""
 
-import dataclasses
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +20,7 @@ PARTS = {"pose_body": (3, 66), "pose_jaw": (66, 69), "pose_eye": (69, 75), "pose
 
 
 def export_amass(finished: Finished, folder: Path, up: Up = "y") -> Exported:
-    """Write `amass_<person>.npz` with the keys of AMASS.
-
-    Args:
-        finished: The result.
-        folder: Where the files go.
-        up: y: the world of scene.json; z: AMASS' own, (x, y, z) becoming (x, -z, y).
+    """Write `amass_<person>.npz` with AMASS' keys; with z up, (x, y, z) becomes (x, -z, y).
 
     Raises:
         InputError: If the parameters of the bodies are not known.
@@ -35,19 +30,21 @@ def export_amass(finished: Finished, folder: Path, up: Up = "y") -> Exported:
         raise InputError(f"--to amass: {motion}")
     assert bodies is not None
     files, notes = list[Path](), list[str]()
-    moved = motion if up == "y" else _upright(motion)
-    for track in tracks_of(bodies):
-        files.append(folder / f"amass_{track.person}.npz")
-        write_npz({**_arrays(moved, track, bodies), "up_axis": np.array(up)}, files[-1])
-    model = skin_of(motion.pose, bodies)
-    if model is not None:
+    if (model := skin_of(motion.pose, bodies)) is not None:
         off = misses(motion, model, bodies)
         notes.append(f"the parameters give the result's meshes within {off:.4f} m")
     if float((motion.size - 1).abs().max()) > 1e-3:
-        low, high = float(motion.size.min()), float(motion.size.max())
-        notes.append(
-            f"bodies are {low:.3f} to {high:.3f} times the size that their betas say ('size')"
-        )
+        sizes = f"{float(motion.size.min()):.3f} to {float(motion.size.max()):.3f}"
+        notes.append(f"bodies are {sizes} times the size that their betas say ('size')")
+    if up == "z":  # the root turns about the pelvis
+        pose, turn = motion.pose, rot_x(torch.tensor(torch.pi / 2))
+        offset = pelvis_of(pose)
+        position = (pose.transl + offset) @ turn.mT - offset
+        root = rotation_vectors(turn @ axis_angle(pose.global_orient))
+        motion = Motion(replace(pose, transl=position, global_orient=root), motion.size)
+    for track in tracks_of(bodies):
+        files.append(folder / f"amass_{track.person}.npz")
+        write_npz({**_arrays(motion, track, bodies), "up_axis": np.array(up)}, files[-1])
     return Exported(tuple(files), tuple(notes))
 
 
@@ -80,12 +77,3 @@ def _arrays(motion: Motion, track: Track, bodies: Bodies) -> dict[str, NDArray[A
         **{name: values[rows].numpy() for name, values in pose.extra.items()},
         **{name: poses[:, start:end] for name, (start, end) in parts},
     }
-
-
-def _upright(motion: Motion) -> Motion:
-    """The same motion in a world with +z up; the root turns about the pelvis."""
-    pose, turn = motion.pose, rot_x(torch.tensor(torch.pi / 2))
-    offset = pelvis_of(pose)
-    position = (pose.transl + offset) @ turn.mT - offset
-    root = rotation_vectors(turn @ axis_angle(pose.global_orient))
-    return Motion(dataclasses.replace(pose, transl=position, global_orient=root), motion.size)

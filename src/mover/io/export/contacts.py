@@ -59,12 +59,7 @@ def export_contacts(finished: Finished, folder: Path, up: Up = "y") -> Exported:
     """Write `contacts_<person>.npz`: a table of frames, parts of the body and objects.
 
     Rows are the frames in which the person is seen; positions and normals are NaN where nothing is
-    touched.
-
-    Args:
-        finished: The result.
-        folder: Where the files go.
-        up: y: the world of scene.json; z: that of simulators, with the floor at 0.
+    touched. With z up the floor is at 0.
 
     Raises:
         InputError: If the result has no labels.
@@ -82,10 +77,9 @@ def export_contacts(finished: Finished, folder: Path, up: Up = "y") -> Exported:
         kept = (labels.person == track.person) & torch.isin(labels.frame, track.frame)
         rows = torch.searchsorted(track.frame, labels.frame[kept])
         cells = rows, labels.part[kept], labels.object[kept]
-        shape = (len(track.frame), len(labels.parts), len(labels.objects))
-        contact = torch.zeros(shape)
+        contact = torch.zeros(len(track.frame), len(labels.parts), len(labels.objects))
         contact[cells] = labels.confidence[kept].float()
-        spots = {key: torch.full((*shape, 3), torch.nan) for key in ("position", "normal")}
+        spots = {key: torch.full((*contact.shape, 3), torch.nan) for key in ("position", "normal")}
         for name, table in spots.items():
             table[cells] = getattr(labels, name)[kept].float()
         arrays = {
@@ -100,5 +94,5 @@ def export_contacts(finished: Finished, folder: Path, up: Up = "y") -> Exported:
         }
         files.append(folder / f"contacts_{track.person}.npz")
         write_npz(arrays, files[-1])
-    share = f"object_contact is a confidence of {SURE:g} or more of any part"
-    return Exported(tuple(files), (share,))
+    note = f"object_contact is a confidence of {SURE:g} or more of any part"
+    return Exported(tuple(files), (note,))

@@ -46,13 +46,7 @@ class Exported:
 
 
 def read_finished(out: Path, capture: Path | None = None) -> Finished:
-    """Read a result.
-
-    Args:
-        out: Folder of the result.
-        capture: Folder of the capture; its bodies.npz has the parameters of the bodies where the
-            result has none.
-    """
+    """A result, and the bodies of its capture, which have parameters where the result has none."""
     scene = read_scene(out / "scene.json")
     file = out / "bodies.npz"
     bodies = read_bodies(file) if file.is_file() else None
@@ -109,13 +103,10 @@ def keyframes(
     tolerance: float,
     most: int,
 ) -> tuple[list[int], float]:
-    """Indices of key frames between which a mesh moves in nearly straight lines.
+    """Key frames between which a mesh moves in nearly straight lines, and the largest miss [m].
 
     The frame that the lines miss most becomes a key frame, until none is missed by more than
-    `tolerance` or there are `most` [m].
-
-    Returns:
-        The indices, the first and the last frame among them, and the largest miss [m].
+    `tolerance` [m] or there are `most`; the first and the last frame are among them.
     """
     watched = verts[:, :: max(1, verts.shape[1] // WATCHED)].double()
     time, miss = time.double(), torch.zeros(len(verts), dtype=torch.float64)

@@ -36,14 +36,10 @@ SHAPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 
 
 def export_glb(finished: Finished, folder: Path, body: BodyForm = "auto") -> Exported:
-    """Write the room with moving people as one binary glTF file.
+    """Write the room with moving people as `scene.glb`.
 
-    Args:
-        finished: The result.
-        folder: Where `scene.glb` goes.
-        body: How people move: on the bones of their model (skin: small, a copy within 2 cm), by
-            shapes of chosen frames (morph: those are exact), or not at all (none); auto: on bones
-            where the parameters are known.
+    People move on the bones of their model (skin: small, a copy within 2 cm), by shapes of chosen
+    frames (morph: those are exact), or not at all (none); auto: on bones where these are known.
 
     Raises:
         InputError: If bones are asked for and there are none.
@@ -171,14 +167,7 @@ def _add_presence(file: Gltf, node: int, track: Track) -> None:
 
 
 def _add_stays(file: Gltf, item: SceneObject, first: int, step: float) -> None:
-    """Put an object where it stands in each of its segments; it jumps between them.
-
-    Args:
-        file: Has the object as a node of its placement.
-        item: An object with segments.
-        first: The frame at 0 s.
-        step: Between two frames [s].
-    """
+    """Let an object jump from segment to segment; frame `first` is at 0 s, a frame lasts `step`."""
     wanted = placement_of(item).T.reshape(-1)
     node = next(
         index for index, node in enumerate(file.tree["nodes"])

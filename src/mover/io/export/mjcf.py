@@ -13,16 +13,9 @@ import torch
 from mover.core.colours import colour
 from mover.core.files import replacing
 from mover.core.run import Run
-from mover.core.types import Camera, Mesh, Scene
+from mover.core.types import Mesh, Scene
 from mover.io.export.finished import Exported, Finished, clock_of
-from mover.io.export.solids import (
-    AXES,
-    FRICTION,
-    Solid,
-    floor_height,
-    moved_to,
-    solids_of,
-)
+from mover.io.export.solids import AXES, FRICTION, Solid, floor_height, moved_to, solids_of
 
 STEP = 0.002  # [s]
 VISUAL, COLLISION = "meshes/visual", "meshes/collision"
@@ -30,12 +23,7 @@ RESERVED = "world"
 
 
 def export_mjcf(finished: Finished, folder: Path) -> Exported:
-    """Write `mjcf/room.xml` and its meshes.
-
-    Args:
-        finished: The result.
-        folder: Gets the folder `mjcf`.
-    """
+    """Write `mjcf/room.xml` and its meshes."""
     solids = solids_of(finished.scene, Run(finished.out))
     root, meshes = mjcf_of(finished.scene, solids)
     notes = ["+z is up and the floor is at 0", ", ".join(f"{s.id} {s.mass:.0f} kg" for s in solids)]
@@ -59,13 +47,7 @@ def text_of(root: Element) -> str:
 def mjcf_of(
     scene: Scene, solids: Sequence[Solid], looks: bool = True
 ) -> tuple[Element, dict[str, bytes]]:
-    """The model, and its mesh files by name.
-
-    Args:
-        scene: Gives the camera and the floor.
-        solids: Its furniture.
-        looks: Whether the meshes that are seen are part of it, beside those that collide.
-    """
+    """The model, and its mesh files by name; with `looks` also the meshes that are only seen."""
     import trimesh
     from trimesh.exchange.obj import export_obj
 
@@ -85,7 +67,12 @@ def mjcf_of(
     lamp = {"ambient": "0.4 0.4 0.4", "diffuse": "0.5 0.5 0.5"}
     SubElement(SubElement(root, "visual"), "headlight", lamp)
     SubElement(world, "light", pos="0 0 4", dir="0 0 -1", diffuse="0.5 0.5 0.5")
-    _add_camera(world, scene.camera, floor_height(scene))
+    camera = scene.camera  # MuJoCo's cameras look along -z with +y up
+    turn = AXES @ camera.R_cam_world.detach().cpu().double().mT
+    axes = numbers((*turn[:, 0].tolist(), *(-turn[:, 1]).tolist()))
+    lens = 2 * math.degrees(math.atan(camera.height / (2 * float(camera.K[1, 1]))))
+    eye = {"name": "camera", "pos": numbers((0, 0, -floor_height(scene))), "xyaxes": axes}
+    SubElement(world, "camera", eye, fovy=f"{lens:.8g}")
     size = 5.0 + max((float(s.position[:2].abs().max()) for s in solids), default=0.0)
     ground = {"name": "ground", "type": "plane", "size": f"{size:g} {size:g} 0.1"}
     SubElement(world, "geom", ground, rgba="0.86 0.85 0.83 1", friction=numbers(FRICTION))
@@ -106,15 +93,6 @@ def mjcf_of(
                 geom = {"class": "look", "mesh": part, "rgba": numbers((*colour(index), 1.0))}
             SubElement(body, "geom", geom)
     return root, meshes
-
-
-def _add_camera(world: Element, camera: Camera, floor: float) -> None:
-    """At the origin of scene.json; MuJoCo's cameras look along -z with +y up."""
-    turn = AXES @ camera.R_cam_world.detach().cpu().double().mT
-    x, y = turn[:, 0].tolist(), (-turn[:, 1]).tolist()
-    up = 2 * math.degrees(math.atan(camera.height / (2 * float(camera.K[1, 1]))))
-    view = {"name": "camera", "pos": numbers((0, 0, -floor)), "xyaxes": numbers((*x, *y))}
-    SubElement(world, "camera", view, fovy=f"{up:.8g}")
 
 
 def numbers(values: Iterable[float]) -> str:

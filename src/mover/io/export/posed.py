@@ -102,18 +102,12 @@ def all_angles(pose: BodyPose) -> Float[Tensor, "bodies joints 3"]:
 
 
 def skin_of(pose: BodyPose, bodies: Bodies) -> SkinnedBody | None:
-    """The skinned model of the bodies.
-
-    None if the model is not skinned, has other vertices, or other joints than SMPL-X.
-    """
+    """The skinned model of the bodies; None: it has no skin, other vertices or other joints."""
     model = load_model(pose.model, pose.gender)
-    if (
-        not isinstance(model, SkinnedBody)
-        or model.pose_dirs is not None
-        or len(model.parents) != 55
-    ):
+    if not isinstance(model, SkinnedBody) or model.pose_dirs is not None:
         return None
-    return model if len(model.verts) == bodies.verts.shape[1] else None
+    fits = len(model.parents) == 55 and len(model.verts) == bodies.verts.shape[1]
+    return model if fits else None
 
 
 def misses(motion: Motion, model: SkinnedBody, bodies: Bodies) -> float:
@@ -146,18 +140,17 @@ def bones_for(finished: Finished, body: BodyForm, influences: int) -> Skinned | 
     Raises:
         InputError: If bones are asked for and there are none.
     """
-    if finished.bodies is None or body in ("morph", "none"):
+    bodies = finished.bodies
+    if bodies is None or body in ("morph", "none"):
         return "it was not asked for"
-    skin = _skin_for(finished, finished.bodies, influences)
+    motion = motion_of(finished)
+    skin = motion if isinstance(motion, str) else _skin_for(motion, bodies, influences)
     if isinstance(skin, str) and body == "skin":
         raise InputError(f"--body skin: {skin}")
     return skin
 
 
-def _skin_for(finished: Finished, bodies: Bodies, influences: int) -> Skinned | str:
-    motion = motion_of(finished)
-    if isinstance(motion, str):
-        return motion
+def _skin_for(motion: Motion, bodies: Bodies, influences: int) -> Skinned | str:
     model = skin_of(motion.pose, bodies)
     if model is None:
         return f"the model {motion.pose.model!r} has no bones that are known here"

@@ -35,16 +35,11 @@ def write_glb(
 
     Each object is a node of its id that holds its placement; its meshes are those of the user's
     own file where it exists, textures included. `ground` is the floor, `camera` the camera of the
-    video, `body_<person>_<frame>` are up to twelve bodies, evenly chosen.
-
-    Args:
-        scene: The furniture; +y is up, as in glTF.
-        bodies: People in the world of `scene`; None: no people.
-        path: The file to write.
-        append: Adds moving people and objects.
+    video, `body_<person>_<frame>` are up to twelve bodies, evenly chosen; `append` adds what moves.
     """
     import trimesh
     from trimesh.exchange.gltf import export_glb
+    from trimesh.scene.cameras import Camera as View
 
     out = trimesh.Scene()
     for index, item in enumerate(scene.objects):
@@ -54,22 +49,23 @@ def write_glb(
             _add(out, f"{above}_mesh", part, parent_node_name=above, transform=transform)
     if scene.ground is not None:
         _add(out, "ground", _solid(floor_of(scene, scene.ground), (*FLOOR_COLOUR, 1.0), "ground"))
-    chosen: list[int] = []
     if bodies is not None:  # evenly over the frames
         order = torch.argsort(bodies.frame, stable=True)
         steps = torch.linspace(0, len(order) - 1, min(GHOSTS, len(order))).round().long()
-        chosen = order[steps].unique().tolist()
-    for row in chosen:
-        assert bodies is not None
-        person, name = int(bodies.person[row]), f"body_{bodies.person[row]}_{bodies.frame[row]}"
-        mesh = Mesh(bodies.verts[row], bodies.faces)
-        body = _solid(mesh, (*person_colour(person), BODY_ALPHA), name)
-        body.vertex_normals = unit_normals(body.vertex_normals)  # skin is smooth
-        _add(out, name, body)
-    _add_camera(out, scene.camera)
+        for row in order[steps].unique().tolist():
+            person, name = int(bodies.person[row]), f"body_{bodies.person[row]}_{bodies.frame[row]}"
+            mesh = Mesh(bodies.verts[row], bodies.faces)
+            body = _solid(mesh, (*person_colour(person), BODY_ALPHA), name)
+            body.vertex_normals = unit_normals(body.vertex_normals)  # skin is smooth
+            _add(out, name, body)
+    lens = _lens(scene.camera)  # exact in the file alone: see `finish`
+    across = 2 * math.atan(lens["aspectRatio"] * math.tan(lens["yfov"] / 2))
+    fov, size = [math.degrees(v) for v in (across, lens["yfov"])], scene.camera
+    out.camera = View(_free(out, "camera"), resolution=(size.width, size.height), fov=fov)
+    out.camera_transform = view_matrix(scene.camera)
 
     def finish(blocks: dict[Any, bytes], tree: dict[str, Any]) -> None:
-        tree["cameras"][0]["perspective"] = _lens(scene.camera)
+        tree["cameras"][0]["perspective"] = lens
         if append is not None:
             append(blocks, tree)
 
@@ -183,17 +179,6 @@ def floor_of(scene: Scene, height: float) -> Mesh:
     x1, z1 = (flat.amax(0) + FLOOR_MARGIN).tolist()
     corners = [[x0, height, z1], [x1, height, z1], [x1, height, z0], [x0, height, z0]]
     return Mesh(torch.tensor(corners), torch.tensor([[0, 1, 2], [0, 2, 3]]))
-
-
-def _add_camera(out: Any, camera: Camera) -> None:  # noqa: ANN401
-    """The camera at the origin; its lens is exact in the file alone (see `_lens`)."""
-    from trimesh.scene.cameras import Camera as View
-
-    lens = _lens(camera)
-    across = 2 * math.atan(lens["aspectRatio"] * math.tan(lens["yfov"] / 2))
-    fov = [math.degrees(across), math.degrees(lens["yfov"])]
-    out.camera = View(_free(out, "camera"), resolution=(camera.width, camera.height), fov=fov)
-    out.camera_transform = view_matrix(camera)
 
 
 def view_matrix(camera: Camera) -> Float[np.ndarray, "4 4"]:

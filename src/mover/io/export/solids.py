@@ -182,14 +182,10 @@ def _by_coacd(verts: NDArray[np.float64], faces: NDArray[np.int64]) -> list[NDAr
     import coacd  # pyright: ignore[reportMissingImports]
 
     coacd.set_log_level("error")
+    search: dict[str, Any] = {"mcts_iterations": 60, "mcts_nodes": 15, "seed": 0}
+    mesh = coacd.Mesh(verts, faces.astype(np.int32))
     parts = coacd.run_coacd(
-        coacd.Mesh(verts, faces.astype(np.int32)),
-        threshold=HOLLOW,
-        max_convex_hull=MOST,
-        preprocess_mode="off",
-        mcts_iterations=60,
-        mcts_nodes=15,
-        seed=0,
+        mesh, threshold=HOLLOW, max_convex_hull=MOST, preprocess_mode="off", **search
     )
     return [np.asarray(part[0], np.float64) for part in parts]
 

@@ -18,6 +18,7 @@ from mover.core.files import replacing
 from mover.core.run import Run
 from mover.core.types import Bodies, Camera, SceneObject
 from mover.geometry.camera import NEAR
+from mover.io.export import scene_glb
 from mover.io.export.finished import (
     BodyForm,
     Exported,
@@ -28,14 +29,6 @@ from mover.io.export.finished import (
     keyframes,
     tracks_of,
     visible_spans,
-)
-from mover.io.export.scene_glb import (
-    FLOOR_COLOUR,
-    floor_of,
-    linear,
-    losses_of,
-    parts_of,
-    view_matrix,
 )
 from mover.io.export.solids import AXES, FRICTION, Solid, floor_height, solids_of
 
@@ -59,24 +52,17 @@ def pxr(name: str) -> Any:  # noqa: ANN401
         InputError: If usd-core is not installed.
     """
     if find_spec("pxr") is None:
-        raise InputError(
-            "--to usd: usd-core is not installed; pip install '.[usd]' in mover's folder"
-        )
+        cure = "pip install '.[usd]' in mover's folder"
+        raise InputError(f"--to usd: usd-core is not installed; {cure}")
     return import_module(f"pxr.{name}")
 
 
 def export_usd(finished: Finished, folder: Path, body: BodyForm = "auto", up: Up = "y") -> Exported:
-    """Write the room as one binary USD file.
+    """Write the room as `scene.usdc`; with z up the floor is at 0, as simulators have it.
 
     Each object is a rigid body (translation and turn) with two children: `visual`, the meshes of
     the user's file at their size, and `collision`, convex parts. People are meshes with samples of
     time.
-
-    Args:
-        finished: The result; its folder keeps the convex parts.
-        folder: Where `scene.usdc` goes.
-        body: none: without people.
-        up: y: the world of scene.json; z: turned, with the floor at 0, as simulators have it.
 
     Raises:
         InputError: If usd-core is not installed.
@@ -93,7 +79,7 @@ def export_usd(finished: Finished, folder: Path, body: BodyForm = "auto", up: Up
             _add_person(stage, bodies, track)
         stage.GetRootLayer().Save()
     moving = "people's meshes move in straight lines between samples, 2 mm off"
-    notes = ("no people" if bodies is None else moving, *losses_of(finished.scene))
+    notes = ("no people" if bodies is None else moving, *scene_glb.losses_of(finished.scene))
     return Exported((path,), notes)
 
 
@@ -120,14 +106,20 @@ def _head(stage: Stage, finished: Finished, up: Up) -> None:
 
 
 def _add_scene(stage: Stage, finished: Finished, folder: Path) -> None:
-    scene, wood = finished.scene, _add_laws(stage)
+    scene, wood, UsdGeom = finished.scene, _add_laws(stage), pxr("UsdGeom")
     solids = solids_of(scene, Run(finished.out))
     for index, (item, solid) in enumerate(zip(scene.objects, solids, strict=True)):
         _add_solid(stage, _add_object(stage, item, colour(index), folder), solid, wood)
     if scene.ground is not None:
-        floor, path = floor_of(scene, scene.ground), free_path(stage, "/room", "ground")
-        add_mesh(stage, path, floor.verts.numpy(), floor.faces.numpy(), FLOOR_COLOUR)
-    _add_floor(stage, floor_height(scene), wood)
+        floor, path = scene_glb.floor_of(scene, scene.ground), free_path(stage, "/room", "ground")
+        add_mesh(stage, path, floor.verts.numpy(), floor.faces.numpy(), scene_glb.FLOOR_COLOUR)
+    plane = UsdGeom.Plane.Define(stage, free_path(stage, "/room", "floor_collision"))
+    plane.CreateAxisAttr(UsdGeom.Tokens.y)  # without end, for nothing to fall through; not drawn
+    plane.CreatePurposeAttr(UsdGeom.Tokens.guide)
+    plane.CreateExtentAttr(plane.ComputeExtentFromPlugins(plane, pxr("Usd").TimeCode.Default()))
+    move = plane.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble)
+    move.Set(pxr("Gf").Vec3d(0, floor_height(scene), 0))
+    _collide(plane.GetPrim(), wood)
     _add_camera(stage, scene.camera)
 
 
@@ -151,7 +143,7 @@ def _add_object(stage: Stage, item: SceneObject, tint: Colour, folder: Path) -> 
             turn.Set(float(np.degrees(float(segment.yaw))), moment)
     looks = UsdGeom.Xform.Define(stage, node.GetPath().AppendChild("visual"))
     looks.AddScaleOp(double).Set(Gf.Vec3d(*item.scale.tolist()))
-    for part, transform in parts_of(item, tint):
+    for part, transform in scene_glb.parts_of(item, tint):
         path = free_path(stage, str(looks.GetPath()), "mesh")
         mesh = add_mesh(stage, path, np.asarray(part.vertices), np.asarray(part.faces), tint)
         mesh.AddTransformOp(double).Set(Gf.Matrix4d(transform.T.tolist()))
@@ -163,8 +155,7 @@ def _add_camera(stage: Stage, camera: Camera) -> None:
     """USD's cameras look along -z with +y up; the film is moved for the principal point."""
     Gf, UsdGeom = pxr("Gf"), pxr("UsdGeom")
     lens = UsdGeom.Camera.Define(stage, free_path(stage, "/room", "camera"))
-    fx, fy = float(camera.K[0, 0]), float(camera.K[1, 1])
-    cx, cy = float(camera.K[0, 2]), float(camera.K[1, 2])
+    (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
     focal = fx / camera.width * APERTURE
     height = camera.height / fy * focal
     lens.CreateFocalLengthAttr(focal)
@@ -174,7 +165,7 @@ def _add_camera(stage: Stage, camera: Camera) -> None:
     lens.CreateVerticalApertureOffsetAttr(height * (cy / camera.height - 0.5))
     lens.CreateClippingRangeAttr(Gf.Vec2f(NEAR, FAR))
     view = lens.AddTransformOp(UsdGeom.XformOp.PrecisionDouble)
-    view.Set(Gf.Matrix4d(view_matrix(camera).T.tolist()))
+    view.Set(Gf.Matrix4d(scene_glb.view_matrix(camera).T.tolist()))
 
 
 def _add_person(stage: Stage, bodies: Bodies, track: Track) -> None:
@@ -216,18 +207,6 @@ def _collide(prim: Prim, wood: Prim) -> None:
     pxr("UsdPhysics").CollisionAPI.Apply(prim)
     weak = UsdShade.Tokens.weakerThanDescendants
     UsdShade.MaterialBindingAPI.Apply(prim).Bind(wood, weak, "physics")
-
-
-def _add_floor(stage: Stage, height: float, wood: Prim) -> None:
-    """A plane without end that nothing falls through; it is not drawn."""
-    UsdGeom = pxr("UsdGeom")
-    plane = UsdGeom.Plane.Define(stage, free_path(stage, "/room", "floor_collision"))
-    plane.CreateAxisAttr(UsdGeom.Tokens.y)
-    plane.CreatePurposeAttr(UsdGeom.Tokens.guide)
-    plane.CreateExtentAttr(plane.ComputeExtentFromPlugins(plane, pxr("Usd").TimeCode.Default()))
-    move = plane.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble)
-    move.Set(pxr("Gf").Vec3d(0, height, 0))
-    _collide(plane.GetPrim(), wood)
 
 
 def _add_solid(stage: Stage, body: Prim, solid: Solid, wood: Prim) -> None:
@@ -297,7 +276,7 @@ def add_look(stage: Stage, mesh: Prim, part: Any, folder: Path) -> None:  # noqa
     kinds, vertex = Sdf.ValueTypeNames, UsdGeom.Tokens.vertex
     if isinstance(part.visual, ColorVisuals):
         share = np.asarray(part.visual.vertex_colors)[:, :3] / 255
-        light = np.array([linear((r, g, b)) for r, g, b in share.tolist()], np.float32)
+        light = np.array([scene_glb.linear((r, g, b)) for r, g, b in share.tolist()], np.float32)
         mesh.CreateDisplayColorPrimvar(vertex).Set(Vt.Vec3fArray.FromNumpy(light))
         return
     material, uv = part.visual.material, part.visual.uv

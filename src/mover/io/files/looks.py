@@ -50,11 +50,7 @@ class Source:
 def load_parts(at: At, path: Path, *, looks: bool = True, process: bool = False) -> Any:  # noqa: ANN401
     """The scene of a mesh file, as trimesh has it; parts without faces are left out.
 
-    Args:
-        at: How messages call it.
-        path: The file.
-        looks: With materials and textures.
-        process: Whether trimesh merges vertices that are the same.
+    With `looks` it has materials and textures; with `process` vertices that are the same are one.
 
     Raises:
         InputError: If it cannot be read, is too large, has no faces, or names files elsewhere.
@@ -78,7 +74,7 @@ def load_parts(at: At, path: Path, *, looks: bool = True, process: bool = False)
         except Exception as error:  # the parsers of six formats raise anything on broken files
             said = _disguise(path) or f"which cannot be read ({reason(error)})"
             refuse(at, "a readable mesh", f"{at.value!r}, {said}")
-    bare = {name: part for name, part in scene.geometry.items() if not _is_surface(part)}
+    bare = {n: part for n, part in scene.geometry.items() if not len(getattr(part, "faces", ()))}
     if len(bare) == len(scene.geometry):
         count = sum(len(part.vertices) for part in bare.values())
         points = f"{count} points without faces (a cloud of points, or Gaussian splats)"
@@ -87,11 +83,6 @@ def load_parts(at: At, path: Path, *, looks: bool = True, process: bool = False)
     if bare:
         scene.delete_geometry(list(bare))
     return scene
-
-
-def _is_surface(part: Any) -> bool:  # noqa: ANN401
-    """Whether a part of a scene has triangles."""
-    return hasattr(part, "faces") and len(part.faces) > 0
 
 
 def _disguise(path: Path) -> str:
@@ -125,10 +116,8 @@ def check_faces(at: At, faces: NDArray[Any], count: int) -> None:
 def gltf_tree(path: Path) -> Any:  # noqa: ANN401
     """The JSON of a .gltf or .glb; what it holds is not checked."""
     content = path.read_bytes()
-    if path.suffix.lower() == ".glb":
-        start, size = 20, int.from_bytes(content[12:16], "little")
-        content = content[start : start + size]
-    return json.loads(content)
+    end = 20 + int.from_bytes(content[12:16], "little")
+    return json.loads(content[20:end] if path.suffix.lower() == ".glb" else content)
 
 
 def check_gltf(at: At, path: Path, *, pictures: bool = False) -> None:
@@ -143,16 +132,22 @@ def check_gltf(at: At, path: Path, *, pictures: bool = False) -> None:
         if extension in PACKED:
             found = f"{at.value!r}, which is packed by {PACKED[extension]}"
             refuse(at, "glTF without compression (Blender: export without Compression)", found)
-    for kind in ("buffers", "images") if pictures else ("buffers",):
-        for part in tree.get(kind, []):
-            uri = part.get("uri", "data:")
-            outside = ".." in re.split(r"[/\\]", unquote(uri))
-            wanted = kind == "buffers" or outside or path.suffix.lower() == ".glb"
-            if not uri.startswith("data:") and wanted and beside(path, unquote(uri)) is None:
-                refuse(at, f"{kind} beside it", f"{at.value!r} with the file {shown(uri)}")
+    for kind, part, name in _uris(tree):
+        outside = ".." in re.split(r"[/\\]", name) or path.suffix.lower() == ".glb"
+        wanted = kind == "buffers" or (pictures and outside)
+        if wanted and beside(path, name) is None:
+            refuse(at, f"{kind} beside it", f"{at.value!r} with the file {shown(part['uri'])}")
     for count, most, what in _amounts(tree):
         if count > most:
             refuse(at, f"at most {most}", f"{at.value!r} with {count} {what}")
+
+
+def _uris(tree: Any) -> Iterator[tuple[str, dict[str, str], str]]:  # noqa: ANN401
+    """The buffers and images that lie in files of their own: kind, part, name of the file."""
+    for kind in ("buffers", "images"):
+        for part in tree.get(kind, []):
+            if not part.get("uri", "data:").startswith("data:"):
+                yield kind, part, unquote(part["uri"])
 
 
 def _amounts(tree: Any) -> Iterator[tuple[int, int, str]]:  # noqa: ANN401
@@ -196,9 +191,7 @@ def companions(path: Path) -> tuple[Path, ...]:
     if path.suffix.lower() not in (".obj", ".gltf"):
         return ()
     if path.suffix.lower() == ".gltf":
-        tree = json.loads(path.read_text(encoding="utf-8"))
-        parts = [*tree.get("buffers", []), *tree.get("images", [])]
-        found = [beside(path, unquote(part["uri"])) for part in parts if "uri" in part]
+        found = [beside(path, name) for _, _, name in _uris(gltf_tree(path))]
     else:
         libraries = _libraries(_text(path), path)
         named = [name for library in libraries for name in _maps(_text(library))]
@@ -219,10 +212,8 @@ def beside(path: Path, name: str) -> Path | None:
         full = (home / Path(*way)).resolve()
         if full.is_relative_to(home) and full.is_file():
             return full
-        folders = (
-            [home, *(p for p in home.iterdir() if p.is_dir())] if way == parts[-1:] else [home]
-        )
-        for folder in folders:
+        below = (p for p in home.iterdir() if p.is_dir()) if way == parts[-1:] else ()
+        for folder in (home, *below):
             current: Path | None = folder
             for part in way:
                 known = current.iterdir() if current is not None and current.is_dir() else ()
@@ -342,16 +333,12 @@ def _materials(path: Path, text: str) -> tuple[str, dict[str, bytes], list[str]]
 def _gltf(path: Path) -> Source:
     """A .gltf that names its files as they are called."""
     tree, files, lost = gltf_tree(path), dict[str, bytes](), list[str]()
-    for kind in ("buffers", "images"):
-        for k, part in enumerate(tree.get(kind, [])):
-            uri = part.get("uri", "data:")
-            if uri.startswith("data:"):
-                continue
-            found, part["uri"] = beside(path, unquote(uri)), f"{kind}_{k}"
-            if found is None:
-                lost.append(f"the texture {unquote(uri)}, which is not beside it")
-            else:
-                files[part["uri"]] = found.read_bytes()
+    for k, (kind, part, name) in enumerate(_uris(tree)):
+        found, part["uri"] = beside(path, name), f"{kind}_{k}"
+        if found is None:
+            lost.append(f"the texture {name}, which is not beside it")
+        else:
+            files[part["uri"]] = found.read_bytes()
     return Source(json.dumps(tree).encode(), files, tuple(lost))
 
 

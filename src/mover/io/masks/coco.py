@@ -4,7 +4,7 @@ import ast
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from msgspec import Struct
@@ -13,17 +13,7 @@ from numpy.typing import NDArray
 from mover.core.errors import InputError
 from mover.core.types import Camera, Masks
 from mover.geometry.rle import run_lengths
-from mover.io.files.fields import (
-    LAST_ID,
-    At,
-    Warn,
-    get,
-    integer,
-    items,
-    maybe,
-    refuse,
-    unique,
-)
+from mover.io.files.fields import LAST_ID, At, Warn, get, integer, items, maybe, refuse, unique
 from mover.io.files.schema import Id, Text, checked
 
 CORNERS = 3  # a polygon has at least so many
@@ -37,37 +27,45 @@ def from_coco(segmentation: Any, height: int, width: int, where: str) -> bytes: 
     Raises:
         InputError: If it is malformed or does not fit the image. It may be empty.
     """
-    if isinstance(segmentation, str):
-        segmentation = _of_text(segmentation, height, width)
+    from pycocotools import mask as coco
+
+    if isinstance(segmentation, str):  # printed by Python, or a code that belongs to this image
+        whole = {"size": [height, width], "counts": segmentation}
+        start = segmentation.strip()[:1]
+        segmentation = _unprinted(segmentation, whole) if start in ("{", "[") else whole
     if isinstance(segmentation, list | tuple):
-        return _from_polygons(_nested(segmentation), height, width, where)
+        polygons = _nested(segmentation)
+        if not polygons:
+            _wrong(where, "no polygon", "[[x, y, ...], ...]")
+        for i, polygon in enumerate(polygons):
+            _check_polygon(polygon, 2 * max(height, width), where, f"polygon {i} with")
+        outlines: Any = [[float(v) for v in polygon] for polygon in polygons]
+        return coco.merge(coco.frPyObjects(outlines, height, width))["counts"]  # pyright: ignore
     if not isinstance(segmentation, dict):
         kinds = "polygons [[x, y, ...], ...] or a run-length code {size, counts}"
-        raise InputError(f"{where} has {type(segmentation).__name__}, expected {kinds}")
+        _wrong(where, type(segmentation).__name__, kinds)
     size, counts = segmentation.get("size"), segmentation.get("counts")
     if not isinstance(size, list | tuple) or tuple(size) != (height, width):
-        at_most = str(size)[:40]
-        raise InputError(f"{where} has size {at_most}, expected [{height}, {width}] (h, w)")
+        _wrong(where, f"size {str(size)[:40]}", f"[{height}, {width}] (h, w)")
     runs = _runs(counts, where)
     if (runs < 0).any() or runs.sum() != height * width:
         found = f"runs that sum to {runs.sum()}" if (runs >= 0).all() else "a negative run"
-        raise InputError(
-            f"{where} has counts with {found}, expected runs that sum to {height} x {width}"
-        )
+        _wrong(where, f"counts with {found}", f"runs that sum to {height} x {width}")
     if isinstance(counts, bytes):
         return counts
-    from pycocotools import mask as coco
-
     code: Any = {"size": [height, width], "counts": [int(n) for n in runs]}
     return coco.frPyObjects(code, height, width)["counts"]  # pyright: ignore
 
 
-def _of_text(written: str, height: int, width: int) -> Any:  # noqa: ANN401
-    """What Python printed of polygons or of a code; a code by itself belongs to this image."""
-    if written.strip()[:1] in ("{", "["):
-        with suppress(ValueError, SyntaxError, MemoryError, RecursionError):
-            return ast.literal_eval(written.strip())
-    return {"size": [height, width], "counts": written}
+def _wrong(where: str, found: str, expected: str) -> NoReturn:
+    raise InputError(f"{where} has {found}, expected {expected}")
+
+
+def _unprinted(written: str, other: Any) -> Any:  # noqa: ANN401
+    """What Python printed as this text; `other` where it is none of that."""
+    with suppress(ValueError, SyntaxError, MemoryError, RecursionError):
+        return ast.literal_eval(written.strip())
+    return other
 
 
 def _nested(polygons: Sequence[Any]) -> Sequence[Any]:
@@ -91,48 +89,31 @@ def _runs(counts: Any, where: str) -> NDArray[np.int64]:  # noqa: ANN401
     """The runs of a code of either kind."""
     if isinstance(counts, list | tuple):
         if not all(type(n) is int and abs(n) < 1 << 40 for n in counts):
-            raise InputError(f"{where} has a list of counts, expected whole numbers in it")
+            _wrong(where, "a list of counts", "whole numbers in it")
         return np.array(counts, dtype=np.int64)
     if not isinstance(counts, str | bytes):
-        kinds = "a list of runs or a compressed code"
-        raise InputError(f"{where} has {type(counts).__name__} as counts, expected {kinds}")
+        name = type(counts).__name__
+        _wrong(where, f"{name} as counts", "a list of runs or a compressed code")
     if isinstance(counts, str) and re.fullmatch(r"b'.*'|b\".*\"", counts):
-        with suppress(ValueError, SyntaxError):  # str() of bytes
-            counts = ast.literal_eval(counts)
+        counts = _unprinted(counts, counts)
     try:
         return run_lengths(counts if isinstance(counts, bytes) else counts.encode("ascii"))
     except ValueError as error:
-        raise InputError(
-            f"{where} has counts with {error}, expected COCO's compressed code"
-        ) from error
+        _wrong(where, f"counts with {error}", "COCO's compressed code")
 
 
-def _from_polygons(polygons: Sequence[Any], height: int, width: int, where: str) -> bytes:
-    """The union of polygons, clipped to the image."""
-    from pycocotools import mask as coco
-
-    if not polygons:
-        raise InputError(f"{where} has no polygon, expected [[x, y, ...], ...]")
-    for i, polygon in enumerate(polygons):
-        _check_polygon(polygon, height, width, f"{where} has polygon {i} with")
-    outlines: Any = [[float(v) for v in polygon] for polygon in polygons]
-    codes: Any = coco.frPyObjects(outlines, height, width)
-    return coco.merge(codes)["counts"]  # pyright: ignore
-
-
-def _check_polygon(polygon: Any, height: int, width: int, where: str) -> None:  # noqa: ANN401
+def _check_polygon(polygon: Any, reach: float, where: str, what: str) -> None:  # noqa: ANN401
     """Refuse what the rasteriser would crash on or draw as nonsense."""
-    words = [v for v in polygon if isinstance(v, str)] if isinstance(polygon, list | tuple) else []
+    given: Any = polygon if isinstance(polygon, list | tuple) else ()
+    words = [v for v in given if isinstance(v, str)]
     if words:
-        found = f"text ({words[0][:40]!r})"
-        raise InputError(f"{where} {found}, expected numbers x, y without quotes")
-    real = isinstance(polygon, list | tuple) and all(type(v) in (int, float) for v in polygon)
-    if not real or len(polygon) < 2 * CORNERS or len(polygon) % 2:
-        found = f"{len(polygon)} items" if isinstance(polygon, list | tuple) else str(polygon)[:40]
-        raise InputError(f"{where} {found}, expected numbers x, y of {CORNERS} corners or more")
-    reach = 2 * max(height, width)
-    if not all(-reach <= v <= reach for v in polygon):
-        raise InputError(f"{where} a corner far outside, expected pixels of the image")
+        _wrong(where, f"{what} text ({words[0][:40]!r})", "numbers x, y without quotes")
+    real = all(type(v) in (int, float) for v in given)
+    if not real or len(given) < 2 * CORNERS or len(given) % 2:
+        found = f"{len(given)} items" if polygon is given else str(polygon)[:40]
+        _wrong(where, f"{what} {found}", f"numbers x, y of {CORNERS} corners or more")
+    if not all(-reach <= v <= reach for v in given):
+        _wrong(where, f"{what} a corner far outside", "pixels of the image")
 
 
 def check_image(at: At, camera: Camera) -> int:
@@ -190,11 +171,8 @@ def annotations_tree(
 ) -> dict[str, Any]:
     """The content of objects.json of rows that have the names of their categories as ids.
 
-    Args:
-        rows: Annotations of the one image.
-        image: Its fields but the id, 0.
-        names: All categories; None: those of the rows.
-        first: The id of the first.
+    They are annotations of one `image`, whose id is 0. The ids of all categories (None: those of
+    the rows) start at `first`.
     """
     names = list(dict.fromkeys(row["category_id"] for row in rows)) if names is None else names
     known = {name: first + i for i, name in enumerate(names)}

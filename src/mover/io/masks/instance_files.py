@@ -15,7 +15,6 @@ from mover.io.files.fields import (
     choice,
     get,
     items,
-    mapping,
     maybe,
     number,
     read_json,
@@ -30,23 +29,21 @@ from mover.io.masks.instances import (
     Instance,
     Instances,
     Size,
-    checked_code,
+    code_in,
     fitted,
     followed,
     frames_of,
+    is_person,
     mask_code,
     objects_tree,
     people_in,
-    things_in,
 )
 from mover.io.masks.label_images import (
     PICTURES,
     Names,
     pictures_in,
-    read_label_folders,
     read_label_images,
     read_mask_arrays,
-    read_mask_dump,
 )
 from mover.io.people.values import PICKLES, natural, number_in
 
@@ -78,6 +75,11 @@ EXPORTS = {
     "an archive": "the files in it: unpack it",
 }
 """What is not read, and what to export in its place."""
+FOREIGN = {
+    ".xml": "an XML of Pascal VOC", ".txt": "YOLO's text", ".zip": "an archive",
+    ".csv": "a project of VIA",
+}  # fmt: skip
+"""What files of other kinds are."""
 
 
 def mask_parts(source: Path, hints: Hints) -> Parts:
@@ -123,7 +125,7 @@ def read_things(
     found = fitted(found, fit or size)
     if people:
         return people_in(found)
-    return dataclasses.replace(found, items=tuple(things_in(found)))
+    return dataclasses.replace(found, items=tuple(i for i in found.items if not is_person(i)))
 
 
 def read_people(path: Path, names: Names, size: Size | None, fit: Size | None = None) -> Instances:
@@ -147,15 +149,19 @@ def read_instances(
     if path.is_dir():
         return _of_folder(path, names, size, people=people, picture=picture)
     kind = path.suffix.lower()
-    if kind in (".npz", ".npy"):
+    if kind in (".npz", ".npy", *PICKLES):
         return read_mask_arrays(path, names, people=people)
-    if kind in PICKLES:
-        return read_mask_dump(path, names, people=people)
     if kind in PICTURES:
         return read_label_images([path], path, names, people=people)
-    if kind != ".json":
-        _refuse_export(path, kind)
-    return _of_json(read_json(path), names, size, picture)
+    if kind == ".json":
+        return _of_json(read_json(path), names, size, picture)
+    head = path.read_bytes()[:2000] if path.is_file() else b""
+    found = FOREIGN.get(kind)
+    found = "CVAT's XML" if kind == ".xml" and b"<annotations" in head else found
+    if found and head:
+        raise InputError(f"{path}: is {found}, expected {EXPORTS[found]}")
+    kinds = ".json, .npz, .npy, .pkl, .png or a folder of pictures"
+    raise InputError(f"{path}: is no file of masks, expected {kinds}")
 
 
 def _of_folder(
@@ -164,10 +170,9 @@ def _of_folder(
     """A folder of pictures, of arrays, of folders of those, or of JSON files."""
     if (path / "mask_data").is_dir():
         path = path / "mask_data"
-    if found := pictures_in(path):
+    homes = [path] if pictures_in(path) else [p for p in path.iterdir() if p.is_dir()]
+    if found := [file for home in homes for file in pictures_in(home)]:
         return read_label_images(found, path, names, people=people)
-    if any(pictures_in(home) for home in path.iterdir() if home.is_dir()):
-        return read_label_folders(path, names)
     files = sorted(path.glob("*.json"), key=natural)
     if not files:
         raise InputError(f"{path}: has no masks, expected pictures (.png), .npy or .json files")
@@ -186,33 +191,20 @@ def _of_folder(
     return Instances(rows, next(iter(sizes), size), path.name, looked, notes)
 
 
-def _refuse_export(path: Path, kind: str) -> None:
-    """Name what other programs write, and the export that is read."""
-    head = path.read_bytes()[:2000] if path.is_file() else b""
-    known = {
-        ".xml": "CVAT's XML" if b"<annotations" in head else "an XML of Pascal VOC",
-        ".txt": "YOLO's text", ".zip": "an archive", ".csv": "a project of VIA",
-    }  # fmt: skip
-    if kind in known and head:
-        raise InputError(f"{path}: is {known[kind]}, expected {EXPORTS[known[kind]]}")
-    kinds = ".json, .npz, .npy, .pkl, .png or a folder of pictures"
-    raise InputError(f"{path}: is no file of masks, expected {kinds}")
-
-
 def _of_json(at: At, names: Names, size: Size | None, picture: str | None) -> Instances:
     """JSON, by its keys."""
     rows = at.value if isinstance(at.value, list) else [at.value]
     keys = [set(row) if isinstance(row, dict) else set[str]() for row in rows]
     inner = at.value.values() if isinstance(at.value, dict) else ()
-    told: str | None = None
-    if any({"data", "annotations"} <= one or "completions" in one for one in keys):
-        told = "Label Studio's JSON"
-    elif any("_via_img_metadata" in one for one in keys) or any(
-        isinstance(row, dict) and "regions" in row for row in inner
-    ):
-        told = "a project of VIA"
-    if told:
-        raise InputError(f"{at.file}: is {told}, expected its export as {EXPORTS[told]}")
+    foreign = {
+        "Label Studio's JSON": any(
+            {"data", "annotations"} <= k or "completions" in k for k in keys
+        ),
+        "a project of VIA": any("_via_img_metadata" in one for one in keys)
+        or any(isinstance(row, dict) and "regions" in row for row in inner),
+    }
+    for found in (name for name, seen in foreign.items() if seen):
+        raise InputError(f"{at.file}: is {found}, expected its export as {EXPORTS[found]}")
     if isinstance(at.value, list):
         return list_instances(at, names, size)
     (have,) = keys
@@ -237,6 +229,11 @@ class ImageFields(Struct, frozen=True):
     width: Side | None = None
     height: Side | None = None
     file_name: Any = None
+
+    @property
+    def stem(self) -> str:
+        """The name of its file without folders and ending."""
+        return Path(str(self.file_name or "").replace("\\", "/")).stem
 
 
 class RowFields(Struct, frozen=True):
@@ -282,7 +279,7 @@ def coco_instances(
         rows = [(item, row) for item, row in rows if row.image_id == ours.id]
     if picture is not None and len(rows) > MOST_THINGS:
         refuse(get(at, "annotations"), f"at most {MOST_THINGS} in a picture", f"{len(rows)} items")
-    sizes = _sizes_of(listed, size)
+    sizes = {image.id: _size_of_image(item, image, size) for item, image in listed}
     tracked = any(row.track_id is not None for _, row in rows)
     frames, more = _frames_of_images([image for _, image in listed], at.file, tracked=tracked)
     found = [_instance(item, row, sizes[row.image_id or 0], words, frames) for item, row in rows]
@@ -292,15 +289,10 @@ def coco_instances(
     return Instances(tuple(found), own, at.file, looked, (*notes, *more))
 
 
-def _sizes_of(images: Sequence[tuple[At, ImageFields]], size: Size | None) -> dict[int, Size]:
-    """Width and height of each image by its id; of those without, the known ones."""
-    sizes: dict[int, Size] = {}
-    for item, image in images:
-        own = (image.width, image.height) if image.width and image.height else size
-        if own is None:
-            refuse(item, "width and height, here or by --image")
-        sizes[image.id] = own
-    return sizes
+def _size_of_image(at: At, image: ImageFields, size: Size | None) -> Size:
+    """Width and height of an image: its own, else the known ones [px]."""
+    own = (image.width, image.height) if image.width and image.height else size
+    return own or refuse(at, "width and height, here or by --image")
 
 
 def _ours(
@@ -308,7 +300,7 @@ def _ours(
 ) -> ImageFields:
     """The one image of a file that is the reference picture."""
     stem = Path(picture or "reference.jpg").stem.lower()
-    named = [i for i in images if _stem(i).lower() == stem]
+    named = [i for i in images if i.stem.lower() == stem]
     full = [i for i in images if i.id in used]
     fits = [i for i in full if size is None or (i.width, i.height) in (size, (None, None))]
     for group in (named, full, fits):
@@ -319,16 +311,11 @@ def _ours(
     raise InputError(f"{file}: has {len(images)} images ({few} ...), expected one called {wanted}")
 
 
-def _stem(image: ImageFields) -> str:
-    """The name of an image's file without folders and ending."""
-    return Path(str(image.file_name or "").replace("\\", "/")).stem
-
-
 def _frames_of_images(
     images: Sequence[ImageFields], file: str, *, tracked: bool
 ) -> tuple[dict[int, int], tuple[str, ...]]:
     """Frames by the ids of images. In files of this program ids of tracked people are frames."""
-    stems = [_stem(image) for image in images]
+    stems = [image.stem for image in images]
     numbers = {i.id: number_in(s, -1) for i, s in zip(images, stems, strict=True)}
     plain = {s.rstrip("0123456789") for s in stems}
     if -1 in numbers.values() or len(set(numbers.values())) < len(images) or len(plain) > 1:
@@ -359,12 +346,8 @@ def list_instances(at: At, names: Names, size: Size | None) -> Instances:
     frames, notes = frames_of(images, f"{at.file}: image_ids")
     found: list[Instance] = []
     for item, row in rows:
-        if isinstance(row.segmentation, dict):
-            height, width = checked(get(get(item, "segmentation"), "size"), tuple[Side, Side])
-            size = width, height
-        elif isinstance(row.mask, list) and row.mask:
-            height, width = mask_code(get(item, "mask"))["size"]
-            size = width, height
+        given = _drawn(item, row)
+        size = _size_of(given) if given is not None and isinstance(given.value, dict) else size
         found.append(_instance(item, row, size, words, frames))
     return Instances(tuple(found), size, at.file, frozenset(frames.values()), notes)
 
@@ -378,50 +361,51 @@ def _instance(
         *box, last = vector(get(at, "bbox"), 5)
         score = number(At(last, at.file, f"{at.field}.bbox"), 0, 1) if score is None else score
     elif row.bbox is not None:
-        a, b, c, d = vector(get(at, "bbox"), 4)
-        box = (a, b, a + c, b + d) if row.name is None else (a, b, c, d)
-    given, mask = get(at, "segmentation"), None
-    if isinstance(row.mask, list):
-        given = get(at, "mask")
-        code = mask_code(given)
-        mask = checked_code(code, (code["size"][1], code["size"][0]), given)
-    elif is_drawn(row.segmentation):
-        if size is None:
-            refuse(given, "the size of the image beside polygons: give --image")
-        mask = checked_code(row.segmentation, size, given)
+        box = _corners(get(at, "bbox"), sized=row.name is None)
     key = -1 if row.category_id is None else row.category_id
     return Instance(
         category=words.get(key, UNKNOWN) if row.name is None else str(row.name),
         box=None if box is None else tuple(box),
-        mask=mask,
+        mask=code_in(_drawn(at, row), size),
         score=1.0 if score is None else score,
         frame=0 if row.image_id is None else frames[row.image_id],
         track=row.track_id,
     )
 
 
+def _drawn(at: At, row: RowFields) -> At | None:
+    """What a row has as its mask: rows of pixels as their code, polygons, or a code."""
+    if not isinstance(row.mask, list):
+        return maybe(at, "segmentation")
+    return At(mask_code(get(at, "mask")), at.file, f"{at.field}.mask")
+
+
+def _size_of(code: At) -> Size:
+    """Width and height of a run-length code [px]."""
+    height, width = checked(get(code, "size"), tuple[Side, Side])
+    return width, height
+
+
+def _corners(at: At, *, sized: bool) -> tuple[float, ...]:
+    """The corners of a box that may be given by its width and height."""
+    a, b, c, d = vector(at, 4)
+    return (a, b, a + c, b + d) if sized else (a, b, c, d)
+
+
 def _of_grounded_sam(at: At) -> Instances:
     """The results of Grounded-SAM-2's demos of pictures, with DUMP_JSON_RESULTS."""
     size = checked(get(at, "img_width"), Side), checked(get(at, "img_height"), Side)
-    corners = choice(get(at, "box_format"), ("xyxy", "xywh")) == "xyxy"
+    sized = choice(get(at, "box_format"), ("xyxy", "xywh")) == "xywh"
     found: list[Instance] = []
     for item in items(get(at, "annotations")):
         name, box, given = get(item, "class_name"), maybe(item, "bbox"), get(item, "segmentation")
-        a, b, c, d = vector(box, 4) if box is not None else (0.0, 0.0, 0.0, 0.0)
-        found.append(Instance(
-            category=text(name) if name.value != "" else UNKNOWN,
-            box=None if box is None else (a, b, c, d) if corners else (a, b, a + c, b + d),
-            mask=checked_code(given.value, size, given) if is_drawn(given.value) else None,
-            score=_score(maybe(item, "score")),
-        ))  # fmt: skip
+        category = text(name) if name.value != "" else UNKNOWN
+        corners, score = None if box is None else _corners(box, sized=sized), maybe(item, "score")
+        while score is not None and isinstance(score.value, list) and len(score.value) == 1:
+            (score,) = items(score)
+        sure = 1.0 if score is None else min(number(score, 0, 2), 1.0)  # SAM 2's may be above 1
+        found.append(Instance(category, corners, code_in(given, size), sure))
     return Instances(tuple(found), size, at.file)
-
-
-def _score(at: At | None) -> float:
-    """A score, also as a list of one; networks' own estimates are a little above 1 at times."""
-    while at is not None and isinstance(at.value, list) and len(at.value) == 1:
-        at = items(at)[0]
-    return 1.0 if at is None else min(number(at, 0, 2), 1.0)
 
 
 def _of_mmdet(at: At, names: Names, size: Size | None) -> Instances:
@@ -442,12 +426,9 @@ def _of_mmdet(at: At, names: Names, size: Size | None) -> Instances:
         if str(key) not in table:
             refuse(items(labels)[k], f"a class of COCO, 0 to {len(COCO_CLASSES) - 1}, or --names")
         box = None if boxes is None else tuple(vector(items(boxes)[k], 4))
-        given, mask = None if masks is None else items(masks)[k], None
-        if given is not None:
-            height, width = checked(get(given, "size"), tuple[Side, Side])
-            size = width, height
-            mask = checked_code(mapping(given), size, given)
-        found.append(Instance(table[str(key)], box, mask, score))
+        given = None if masks is None else items(masks)[k]
+        size = size if given is None else _size_of(given)
+        found.append(Instance(table[str(key)], box, code_in(given, size), score))
     note = f"{at.file}: {few} of {len(keys)} detections with scores below {LEAST_SCORE} left out"
     return Instances(tuple(found), size, at.file, notes=(note,) if few else ())
 
@@ -486,7 +467,7 @@ def labelme_instances(at: At) -> Instances:
         groups.setdefault(key, []).append([v for point in points for v in point])
         first.setdefault(key, get(item, "points"))
     found = [
-        Instance(key[0], None, checked_code(polygons, size, first[key]))
+        Instance(key[0], None, code_in(dataclasses.replace(first[key], value=polygons), size))
         for key, polygons in groups.items()
     ]
     return Instances(tuple(found), size, at.file)

@@ -16,7 +16,7 @@ from mover.furniture.library import plain_name, unknown_names
 from mover.geometry.rle import area, decode, encode
 from mover.io.capture.parts import UNKNOWN
 from mover.io.files.fields import LAST_INDEX, At, listed, read_json, refuse
-from mover.io.masks.coco import annotations_tree, from_coco, segmentation
+from mover.io.masks.coco import annotations_tree, from_coco, is_drawn, segmentation
 from mover.io.people import found as bodies
 
 PERSON = frozenset({
@@ -72,10 +72,14 @@ def code_of(pixels: NDArray[Any]) -> bytes | None:
     return encode(torch.from_numpy(np.ascontiguousarray(pixels))) if pixels.any() else None
 
 
-def checked_code(given: Any, size: Size, at: At) -> bytes | None:  # noqa: ANN401
-    """The code of COCO's polygons or run lengths in an image of this size; None where empty."""
+def code_in(given: At | None, size: Size | None) -> bytes | None:
+    """The code of COCO's polygons or run lengths in an image of this size; None: nothing there."""
+    if given is None or not is_drawn(given.value):
+        return None
+    if size is None:
+        refuse(given, "the size of the image beside polygons: give --image")
     width, height = size
-    code = from_coco(given, height, width, at.place)
+    code = from_coco(given.value, height, width, given.place)
     return code if area(Masks(height, width, (code,)), 0) else None
 
 
@@ -83,11 +87,8 @@ def frames_of(numbers: Sequence[int], what: str) -> tuple[dict[int, int], tuple[
     """Frames, counted from 0, by the numbers that a source has for them; gaps stay gaps.
 
     Numbers whose first is 1 count from 1: a video's frame 0 is seldom the only one without a thing.
-    Such as are too large for frames (ids of a data set) are counted in their order.
-
-    Args:
-        numbers: In any order.
-        what: How messages call them.
+    Such as are too large for frames (ids of a data set) are counted in their order. Messages call
+    them `what`.
     """
     known = sorted(set(numbers))
     if not known or known[0] == 0:
@@ -129,11 +130,6 @@ def is_person(item: Instance) -> bool:
     return item.category.lower() in PERSON or plain_name(item.category) in PERSON
 
 
-def things_in(found: Instances) -> list[Instance]:
-    """All but people."""
-    return [item for item in found.items if not is_person(item)]
-
-
 def people_in(found: Instances) -> Instances:
     """The people among the instances, and such as have no name.
 
@@ -162,15 +158,11 @@ def objects_tree(found: Instances, items: Sequence[Instance]) -> At:
     rows: list[dict[str, Any]] = []
     for i, item in enumerate(items):
         row: dict[str, Any] = {"id": i, "image_id": 0, "category_id": item.category}
-        box = item.box
         if item.mask is not None:
-            mask = Masks(height, width, (item.mask,))
-            row["segmentation"] = segmentation(mask, 0)
-            box = tuple(_box_of(item, found.size))
-        if box is None or box[2] <= box[0] or box[3] <= box[1]:
-            continue  # empty: there is nothing of it in the image
-        x, y, right, bottom = box
-        rows.append({**row, "bbox": [x, y, right - x, bottom - y], "score": item.score})
+            row["segmentation"] = segmentation(Masks(height, width, (item.mask,)), 0)
+        x, y, right, bottom = _box_of(item, found.size)
+        if x < right and y < bottom:  # else there is nothing of it in the image
+            rows.append({**row, "bbox": [x, y, right - x, bottom - y], "score": item.score})
     image = {"id": 0, "width": width, "height": height}
     return At(annotations_tree(rows, image, names), found.file)
 
@@ -250,13 +242,7 @@ def _box_of(item: Instance, size: Size | None) -> Sequence[float]:
 
 
 def with_reference_people(people: At | None, found: Instances, folder: Path) -> At:
-    """people.json with these masks as the people of the reference image.
-
-    Args:
-        people: The fields that are to be written; None: those of the folder, or none.
-        found: Their masks.
-        folder: The capture.
-    """
+    """people.json (None: that of the folder, or none) with these masks in the reference image."""
     if people is None and (folder / "people.json").exists():
         people = read_json(folder / "people.json")
     empty = {"images": [], "annotations": [], "categories": [{"id": 1, "name": "person"}]}

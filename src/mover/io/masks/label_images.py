@@ -1,7 +1,8 @@
 """Masks as pixels: pictures, arrays and dumps of SAM 2, of one image or of frames of a video."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,8 @@ from mover.io.files.fields import (
 )
 from mover.io.files.images import opened
 from mover.io.files.npz import read_npy, read_npz
-from mover.io.masks.instances import Instance, Instances, code_of, frames_of
-from mover.io.people.values import natural
+from mover.io.masks.instances import Instance, Instances, Size, code_of, frames_of
+from mover.io.people.values import natural, number_in
 
 MASKS = ("masks", "pred_masks", "mask", "segmentation", "arr_0")
 TRACKS = ("object_ids", "obj_ids", "track_ids", "track", "person", "ids")
@@ -47,6 +48,8 @@ NEAR = 8  # values so near to black or white are black or white, where a mask is
 SAME = 0.5  # overlap of the same person in two frames that follow each other
 Names = Mapping[str, str]
 """Categories where the source has none: by number, file name or index."""
+Row = tuple[NDArray[Any], Instance]
+"""The pixels of a thing, and the thing without its mask."""
 
 
 def read_label_images(
@@ -57,7 +60,8 @@ def read_label_images(
     A category is looked up in labels.json, `names`, then the file name. A picture with an alpha
     channel that is not full, or with one value beside black, is one mask, soft rims or not; one
     with more values is a label map (a pixel is the number of a thing, 0 is nothing). Pictures whose
-    names are the numbers of frames are a video, in which a label is a track.
+    names are the numbers of frames are a video, in which a label is a track. In a folder of folders
+    (SAM 2's) each is one object of a video.
 
     Args:
         paths: The files.
@@ -68,62 +72,68 @@ def read_label_images(
     home = source if source.is_dir() else source.parent
     table = {**_names_beside(home / LABELS), **names}
     paths = sorted((p for p in paths if p.stem.lower() not in NOT_MASKS), key=natural)
-    numbers = _numbers_of([path.stem for path in paths], people=people)
+    homes = list(dict.fromkeys(path.parent for path in paths))
+    apart = source.is_dir() and source not in homes
+    numbers = _numbers_of([path.stem for path in paths], people=people or apart)
+    if apart and numbers is None:
+        bare = next((p.name for p in paths if not re.search(r"\d", p.stem)), paths[0].name)
+        raise InputError(f"{bare}: has no number of a frame in its name")
     frames, notes = frames_of(list((numbers or {}).values()), f"{source.name}: numbers")
-    found, values, sizes = list[Instance](), set[int](), set[tuple[int, int]]()
-    for path in paths:
-        pixels = _labels_of(path)
-        sizes.add((pixels.shape[1], pixels.shape[0]))
-        labels = [int(v) for v in np.unique(pixels) if v != 0]
-        values.update(labels)
-        if len(labels) > MOST_LABELS:
-            n = f"{len(labels)} different values"
-            raise InputError(f"{path.name}: has {n}, expected at most {MOST_LABELS} labels")
-        frame = 0 if numbers is None else frames[numbers[path.stem]]
-        words = {**_classes_beside(path), **table}
-        for label in labels:
-            if numbers is None and len(labels) == 1 and path.suffix.lower() != ".npy":
-                name = words.get(path.stem) or _word_of(path.stem) or UNKNOWN
+
+    def rows() -> Iterator[Row]:
+        for path in paths:
+            frame = None if numbers is None else frames[numbers[path.stem]]
+            if apart:
+                name = names.get(path.parent.name) or _word_of(path.parent.name) or UNKNOWN
+                track = number_in(path.parent.name, homes.index(path.parent))
+                yield _labels_of(path) > 0, Instance(name, None, None, 1.0, frame or 0, track)
             else:
-                name = words.get(str(label), UNKNOWN)
-            track = None if numbers is None else label
-            found.append(Instance(name, None, code_of(pixels == label), frame=frame, track=track))
-    if len(sizes) > 1:
-        raise InputError(f"{source.name}: has pictures of {len(sizes)} sizes, expected one")
-    if numbers is not None and values <= {max(values, default=0)} and values & set(WHITE):
-        found = [Instance(i.category, None, i.mask, frame=i.frame, track=0) for i in found]
+                yield from _labelled(path, {**_classes_beside(path), **table}, frame)
+
+    found = _gathered(rows(), source.name, "pictures", frames.values())
+    tracks = {item.track for item in found.items}
+    if numbers is not None and not apart and len(tracks) == 1 and tracks <= set(WHITE):
+        found = replace(found, items=tuple(replace(item, track=0) for item in found.items))
         notes = (*notes, f"{source.name}: white masks are one person or thing in all frames")
     if people and numbers is None and len(paths) > 1:
         how = "pictures are people of one image; those of frames are named by numbers: 000000.png"
         notes = (*notes, f"{source.name}: {how}")
-    return Instances(
-        tuple(found), next(iter(sizes), None), source.name, frozenset(frames.values()), notes
-    )
+    return replace(found, notes=notes)
 
 
-def read_label_folders(folder: Path, names: Names) -> Instances:
-    """A folder of folders, one an object, of pictures that are called by their frames (SAM 2's)."""
-    folders = sorted((p for p in folder.iterdir() if p.is_dir()), key=natural)
-    files = {home: pictures_in(home) for home in folders}
-    numbers = _numbers_of([p.stem for paths in files.values() for p in paths], people=True) or {}
-    frames, notes = frames_of(list(numbers.values()), f"{folder.name}: numbers")
-    found, sizes = list[Instance](), set[tuple[int, int]]()
-    for rank, home in enumerate(home for home in folders if files[home]):
-        digits = re.findall(r"\d+", home.name)
-        track = int(digits[-1]) if digits else rank
-        name = names.get(home.name) or _word_of(home.name) or UNKNOWN
-        for path in files[home]:
-            if path.stem not in numbers:
-                raise InputError(f"{path.name}: has no number of a frame in its name")
-            pixels = _labels_of(path)
-            sizes.add((pixels.shape[1], pixels.shape[0]))
-            if (code := code_of(pixels > 0)) is not None:
-                found.append(
-                    Instance(name, None, code, frame=frames[numbers[path.stem]], track=track)
-                )
-    if len(sizes) != 1:
-        raise InputError(f"{folder.name}: has pictures of {len(sizes)} sizes, expected one")
-    return Instances(tuple(found), sizes.pop(), folder.name, frozenset(frames.values()), notes)
+def _labelled(path: Path, words: Names, frame: int | None) -> Iterator[Row]:
+    """Each label of a picture; without a frame, a picture of one label is called by its file."""
+    pixels = _labels_of(path)
+    labels = _labels_in(At(pixels, path.name))
+    lone = frame is None and len(labels) == 1 and path.suffix.lower() != ".npy"
+    for label in labels:
+        said = words.get(path.stem) or _word_of(path.stem) if lone else words.get(str(label))
+        track = None if frame is None else label
+        yield pixels == label, Instance(said or UNKNOWN, None, None, 1.0, frame or 0, track)
+    if not labels:  # an empty picture has a size
+        yield pixels > 0, Instance(UNKNOWN, None, None)
+
+
+def _labels_in(at: At) -> list[int]:
+    """The numbers of things in an array of labels."""
+    labels = [int(v) for v in np.unique(at.value[np.isfinite(at.value)]).tolist() if v > 0]
+    if len(labels) > MOST_LABELS:
+        refuse(at, f"at most {MOST_LABELS} labels", f"{len(labels)} different values")
+    return labels
+
+
+def _gathered(
+    rows: Iterable[Row], file: str, what: str, frames: Iterable[int], notes: tuple[str, ...] = ()
+) -> Instances:
+    """Things and their masks of one size, without the empty ones."""
+    found, sizes = list[Instance](), set[Size]()
+    for pixels, item in rows:
+        sizes.add((pixels.shape[1], pixels.shape[0]))
+        if (code := code_of(pixels)) is not None:
+            found.append(replace(item, mask=code))
+    if len(sizes) > 1:
+        raise InputError(f"{file}: has {what} of {len(sizes)} sizes, expected one")
+    return Instances(tuple(found), next(iter(sizes), None), file, frozenset(frames), notes)
 
 
 def pictures_in(folder: Path) -> list[Path]:
@@ -184,17 +194,13 @@ def _numbers_of(stems: Sequence[str], *, people: bool) -> dict[str, int] | None:
 
 
 def _labels_of(path: Path) -> NDArray[np.int64]:
-    """The numbers of a picture or an array of labels (h, w), 0 where there is nothing."""
-    if path.suffix.lower() == ".npy":
+    """Labels (h, w), 0 for nothing, of an array, or the values, colours or alpha of a picture."""
+    kind = path.suffix.lower()
+    if kind == ".npy":
         value = np.squeeze(read_npy(path).value)
         if value.ndim != 2 or value.dtype.kind not in "bui":
             refuse(At(value, path.name), "an array of labels (h, w)")
         return value.astype(np.int64)
-    return read_labels(path)
-
-
-def read_labels(path: Path) -> NDArray[np.int64]:
-    """The numbers of a picture of labels (h, w): palette, grey values or colours, or its alpha."""
     with opened(path, expected="a picture of masks", bombs="error") as picture:
         drawn = picture.mode == "P"
         if picture.mode in ("RGBA", "LA", "PA"):
@@ -205,9 +211,9 @@ def read_labels(path: Path) -> NDArray[np.int64]:
         pixels = np.asarray(picture).astype(np.int64)
     if pixels.ndim == 3:
         grey = (pixels[..., :1] == pixels).all()
-        weights = [1, 0, 0] if grey or path.suffix.lower() in LOSSY else [1, 256, 65536]
+        weights = [1, 0, 0] if grey or kind in LOSSY else [1, 256, 65536]
         pixels = pixels[..., :3] @ weights
-    return pixels if drawn else _hardened(pixels, lossy=path.suffix.lower() in LOSSY)
+    return pixels if drawn else _hardened(pixels, lossy=kind in LOSSY)
 
 
 def _hardened(pixels: NDArray[np.int64], *, lossy: bool) -> NDArray[np.int64]:
@@ -222,11 +228,10 @@ def _hardened(pixels: NDArray[np.int64], *, lossy: bool) -> NDArray[np.int64]:
     else:
         clean = pixels
     same = np.ones_like(pixels, dtype=bool)
-    for axis in (0, 1):
-        equal = np.diff(clean, axis=axis) == 0
-        pad = [(int(a == axis), 0) for a in (0, 1)], [(0, int(a == axis)) for a in (0, 1)]
-        same &= np.pad(equal, pad[0], constant_values=True)
-        same &= np.pad(equal, pad[1], constant_values=True)
+    for whole, flags in ((clean, same), (clean.T, same.T)):
+        equal = np.diff(whole, axis=0) == 0
+        flags[1:] &= equal
+        flags[:-1] &= equal
     solid, counts = np.unique(clean[same & (clean > 0)], return_counts=True)
     between = np.unique(clean[(clean > 0) & (clean < most)])
     inner = counts[solid < most].sum()
@@ -242,59 +247,49 @@ def _hardened(pixels: NDArray[np.int64], *, lossy: bool) -> NDArray[np.int64]:
 
 
 def read_mask_arrays(path: Path, names: Names, *, people: bool = False) -> Instances:
-    """Masks of an .npz or .npy file.
+    """Masks of an .npz, an .npy or a pickle.
 
     `masks` is (n, h, w), (n, 1, h, w) or (frames, objects, h, w), as booleans, bytes or logits
-    (above 0 is inside); or (h, w), a label map. Beside it may stand `scores`, `labels` (names),
-    `object_ids` and `frame`. With a single object id (n, 1, h, w) is one thing in n frames, and so
-    are n masks of people that lie on each other. Boxes are those of the masks.
+    (above 0 is inside); or (h, w), a label map of whole numbers. Beside it may stand `scores`,
+    `labels` (names), `object_ids` and `frame`. With a single object id (n, 1, h, w) is one thing in
+    n frames, and so are n masks of people that lie on each other. Boxes are those of the masks. A
+    pickle may also be what SAM 2's video predictor gives: {frame: {object: mask}}.
     """
-    npz = path.suffix.lower() == ".npz"
-    at = read_npz(path) if npz else At({"masks": read_npy(path).value}, path.name)
-    return of_arrays(at, names, people=people)
-
-
-def read_mask_dump(path: Path, names: Names, *, people: bool = False) -> Instances:
-    """A pickle of what SAM 2's video predictor gives: {frame: {object: mask}}; or of arrays."""
-    tree = load_plain(path)
+    read = {".npz": read_npz, ".npy": read_npy}.get(path.suffix.lower())
+    tree = load_plain(path) if read is None else read(path).value
     at = At({"masks": tree} if isinstance(tree, np.ndarray) else tree, path.name)
-    at = maybe(at, "video_segments") or at
-    rows = [(key, get(at, key)) for key in mapping(at)]
-    if not rows or not all(key.isdecimal() and isinstance(row.value, Mapping) for key, row in rows):
-        return of_arrays(at, names, people=people)
-    found, sizes = list[Instance](), set[tuple[int, int]]()
-    for key, row in rows:
-        for track in mapping(row):
-            mask = get(row, track)
-            pixels = np.squeeze(np.asarray(mask.value))
-            if pixels.ndim != 2 or pixels.dtype.kind not in "buif" or not track.isdecimal():
-                refuse(mask, "a mask (1, h, w) under the number of its object")
-            sizes.add((pixels.shape[1], pixels.shape[0]))
-            name, code = names.get(track, UNKNOWN), code_of(pixels > 0)
-            if code is not None:
-                found.append(Instance(name, None, code, frame=int(key), track=int(track)))
-    if len(sizes) != 1:
-        raise InputError(f"{path.name}: has masks of {len(sizes)} sizes, expected one")
-    return Instances(tuple(found), sizes.pop(), path.name, frozenset(int(key) for key, _ in rows))
-
-
-def of_arrays(at: At, names: Names, *, people: bool) -> Instances:
-    """Masks of arrays by their names."""
+    at = maybe(at, "video_segments") or at if read is None else at
+    frames = [(key, get(at, key)) for key in mapping(at)]
+    if frames and all(key.isdecimal() and isinstance(at.value, Mapping) for key, at in frames):
+        rows = [row for key, at in frames for row in _segments(int(key), at, names)]
+        if not rows:
+            refuse(at, "masks of objects in frames")
+        return _gathered(rows, path.name, "masks", (int(key) for key, _ in frames))
     given = _first(at, MASKS)
     if given is None:
         refuse(at, f"an array named {', '.join(MASKS)}", f"the arrays {sorted(at.value)[:6]}")
     stack = given.value
     if not isinstance(stack, np.ndarray) or stack.dtype.kind not in "buif" or stack.ndim < 2:
         refuse(given, "an array of masks (n, h, w), (frames, objects, h, w) or labels (h, w)")
-    if stack.ndim == 2 and stack.dtype != np.bool_:
-        values = [int(v) for v in np.unique(stack[np.isfinite(stack)]).tolist() if v > 0]
-        if len(values) > MOST_LABELS:
-            refuse(given, f"at most {MOST_LABELS} labels", f"{len(values)} different values")
-        found = [Instance(names.get(str(v), UNKNOWN), None, code_of(stack == v)) for v in values]
-        return Instances(tuple(found), (stack.shape[1], stack.shape[0]), at.file)
+    if stack.ndim == 2 and stack.dtype != np.bool_ and not (np.nan_to_num(stack) % 1).any():
+        labels = _labels_in(given)
+        rows = ((stack == v, Instance(names.get(str(v), UNKNOWN), None, None)) for v in labels)
+        size = stack.shape[1], stack.shape[0]
+        return replace(_gathered(rows, at.file, "masks", ()), size=size)
     if stack.ndim > 4 or not stack.size:
         refuse(given, "an array of masks (n, h, w) or (frames, objects, h, w)")
     return _of_stack(at, stack, names, people=people)
+
+
+def _segments(frame: int, at: At, names: Names) -> Iterator[Row]:
+    """The masks of a frame by the numbers of their objects."""
+    for track in mapping(at):
+        mask = get(at, track)
+        pixels = np.squeeze(np.asarray(mask.value))
+        if pixels.ndim != 2 or pixels.dtype.kind not in "buif" or not track.isdecimal():
+            refuse(mask, "a mask (1, h, w) under the number of its object")
+        name = names.get(track, UNKNOWN)
+        yield pixels > 0, Instance(name, None, None, 1.0, frame, int(track))
 
 
 def _of_stack(at: At, stack: NDArray[Any], names: Names, *, people: bool) -> Instances:
@@ -324,14 +319,14 @@ def _of_stack(at: At, stack: NDArray[Any], names: Names, *, people: bool) -> Ins
         labels = [str(word) for word in array(words, (rows,), "text")]
     if scores is not None and isinstance(scores.value, np.ndarray) and scores.value.size == rows:
         sure = np.clip(array(scores, scores.value.shape).reshape(-1), 0, 1)
-    found: list[Instance] = []
-    for i, pixels in enumerate(flat):
-        code, track = code_of(pixels > 0), None if tracks is None else int(tracks[i])
+
+    def row(i: int) -> Instance:
+        track = None if tracks is None else int(tracks[i])
         name = names.get(str(i if track is None else track)) or labels[i]
-        if code is not None:
-            found.append(Instance(name, None, code, float(sure[i]), int(frames[i]), track))
-    looked = frozenset(frames.tolist())
-    return Instances(tuple(found), (width, height), at.file, looked, notes)
+        return Instance(name, None, None, float(sure[i]), int(frames[i]), track)
+
+    things = ((pixels > 0, row(i)) for i, pixels in enumerate(flat))
+    return _gathered(things, at.file, "masks", frames.tolist(), notes)
 
 
 def _follow_each_other(flat: NDArray[Any]) -> bool:

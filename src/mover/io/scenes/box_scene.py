@@ -16,21 +16,11 @@ from msgspec import Meta, Struct
 
 from mover.furniture.library import choose_piece
 from mover.io.capture.parts import Hints, Parts
+from mover.io.files import schema
 from mover.io.files.cameras import camera_of_tree
 from mover.io.files.fields import At, get, integer, items, maybe, read_json, refuse
 from mover.io.files.images import image_size
-from mover.io.files.schema import (
-    Box,
-    Id,
-    Number,
-    Rows,
-    Share,
-    Sizes,
-    Text,
-    Vector,
-    checked,
-    rotation,
-)
+from mover.io.files.schema import Id, Text, checked, rotation
 from mover.io.masks.instances import Instance, Instances, objects_tree
 from mover.io.scenes.glb_scene import up_axes
 from mover.io.scenes.placing import LEVEL, Matrix, Pieces, Placed, about_y
@@ -40,13 +30,13 @@ class BoxFields(Struct, frozen=True):
     """One box."""
 
     category: Text
-    size: Sizes
-    center: Vector
+    size: schema.Sizes
+    center: schema.Vector
     yaw: Annotated[float, Meta(ge=-10, le=10)] | None = None
-    rotation: Rows | None = None
+    rotation: schema.Rows | None = None
     id: Any = None
-    box2d: Box | None = None
-    score: Share | None = None
+    box2d: schema.Box | None = None
+    score: schema.Share | None = None
     support: Text | None = None
 
 
@@ -57,7 +47,7 @@ class BoxesFields(Struct, frozen=True):
     camera: Any = None
     frame: Literal["world", "camera"] | None = None
     up: Literal["y", "-y", "z"] | None = None
-    ground: Number | None = None
+    ground: schema.Number | None = None
 
 
 def box_parts(path: Path, hints: Hints) -> Parts:

@@ -136,10 +136,7 @@ def _ground(scene: Any, turn: Matrix) -> float | None:  # noqa: ANN401
 
 
 def _view(path: Path, hints: Hints) -> tuple[dict[str, Any], Matrix] | None:
-    """The first camera of the file: fields of camera.json, and its pose in the file's world.
-
-    Without an image it is 1080 pixels high.
-    """
+    """Fields and pose of the file's first camera; 1080 pixels high without an image."""
     try:
         tree: Any = gltf_tree(path)
         nodes = tree.get("nodes", [])
@@ -157,10 +154,8 @@ def _view(path: Path, hints: Hints) -> tuple[dict[str, Any], Matrix] | None:
         fields = {"w": w, "h": h, "fl_x": fx, "fl_y": fy, "cx": w / 2, "cy": h / 2}
         return fields, _pose_of(nodes, index)
     except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
-        raise InputError(
-            f"{path.name}: has a camera that cannot be read ({reason(error)}), "
-            "expected a perspective camera"
-        ) from error
+        found = f"a camera that cannot be read ({reason(error)})"
+        raise InputError(f"{path.name}: has {found}, expected a perspective camera") from error
 
 
 def _pose_of(nodes: Any, index: int) -> Matrix:  # noqa: ANN401

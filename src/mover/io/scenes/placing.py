@@ -43,15 +43,10 @@ class FilePose:
 
 
 def posed(matrix: Matrix, low: Matrix, high: Matrix) -> FilePose:
-    """The place of a mesh whose vertices a matrix takes into the world (+y up).
+    """The pose of a mesh between two corners that a matrix (4, 4) takes into the world (+y up).
 
     Yaw and scale are kept as such. A small tilt is dropped about the centre of the box, since
     furniture stands upright. Anything else (other axes, shear, mirrors) goes into the vertices.
-
-    Args:
-        matrix: World from mesh (4, 4).
-        low: Smallest corner of the mesh.
-        high: Largest corner of the mesh.
     """
     A, t = matrix[:3, :3], matrix[:3, 3]
     size = float(np.abs(A).max())
@@ -102,13 +97,7 @@ class Pieces:
     notes: list[str] = field(default_factory=list[str])
 
     def add(self, category: str, name: str, place: Callable[[str], Placed]) -> None:
-        """Append the object that `place` makes for a free id.
-
-        Args:
-            category: Free text.
-            name: What the tool calls it.
-            place: Fields of scene.json, the mesh with its file, and what was lost.
-        """
+        """Append the object that `place` makes for a free id; `name` is what the tool calls it."""
         key = free_id(category, name, self.meshes)
         fields, self.meshes[key], note = place(key)
         self.notes.extend([f"{key}: {note}"] if note else [])

@@ -91,12 +91,11 @@ def sam3d_parts(folder: Path, hints: Hints) -> Parts:
 
 def _things(folder: Path) -> tuple[list[Path], list[str]]:
     """The meshes of a folder that have a pose, by number or name, and what is passed over."""
-    paths = [
-        path for path in folder.iterdir()
-        if path.suffix.lower() in KINDS and not path.stem.lower().startswith(PEOPLE)
-    ]  # fmt: skip
-    paths.sort(key=lambda p: (len(p.stem) if p.stem.isdecimal() else 0, p.stem,
-                              KINDS.index(p.suffix.lower())))  # fmt: skip
+    kinds = {kind: rank for rank, kind in enumerate(KINDS)}
+    paths = [path for path in folder.iterdir() if path.suffix.lower() in kinds]
+    paths = [path for path in paths if not path.stem.lower().startswith(PEOPLE)]
+    length = {p: len(p.stem) if p.stem.isdecimal() else 0 for p in paths}
+    paths.sort(key=lambda p: (length[p], p.stem, kinds[p.suffix.lower()]))
     clouds = [path for path in paths if is_cloud(path)]
     meshes = [path for path in paths if path not in clouds]
     once = [p for k, p in enumerate(meshes) if p.stem not in [other.stem for other in meshes[:k]]]
@@ -126,8 +125,8 @@ def _pose_beside(path: Path) -> At:
             fields = mapping(at).items()
             plain = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in fields}
             return At(plain, at.file, at.field)
-    expected = f"{path.stem}.npz or {path.stem}.json beside it"
-    raise InputError(f"{path.name}: has no pose, expected {expected}")
+    wanted = f"{path.stem}.npz or {path.stem}.json beside it"
+    raise InputError(f"{path.name}: has no pose, expected {wanted}")
 
 
 def pose_matrix(at: At) -> Matrix:

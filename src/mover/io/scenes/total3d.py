@@ -60,8 +60,6 @@ FURNITURE = (
 """Those that stand in a room and are worth placing."""
 LIFTED = ("television", "box", "sink", "lamp")
 """What may stand on something else or hang on a wall."""
-
-
 ON_FLOOR = 0.3  # [m], such a thing stands on the floor if its box ends so close above it
 TO_OURS = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
 """x forward, y up, z right -> x right, y up, z backward."""
@@ -127,9 +125,8 @@ def read_boxes(path: Path) -> list[TotalBox]:
 
 def _box(at: At, name: str) -> TotalBox:
     """One box: its axes are the rows of `basis`, upright; p = p_local @ basis + centroid."""
-    names = (
-        at.value.dtype.names if isinstance(at.value, np.ndarray) and at.value.size == 1 else None
-    )
+    one = isinstance(at.value, np.ndarray) and at.value.size == 1
+    names = at.value.dtype.names if one else None
     if not names or not {"basis", "coeffs", "centroid"} <= set(names):
         refuse(at, "a struct with basis, coeffs, centroid")
     struct = at.value.ravel()[0]
@@ -191,25 +188,24 @@ def total3d_parts(folder: Path, hints: Hints) -> Parts:
     floor = float(box[:, 1].min())
     if names != [box.name for box in boxes]:
         found = f"{len(boxes)} boxes of {[b.name for b in boxes][:4]} ..."
-        expected = "the classes of detections.json, in order"
-        raise InputError(f"bdb_3d.mat: field 'class_id' has {found}, expected {expected}")
+        at = At(names, "bdb_3d.mat", "class_id")
+        refuse(at, "the classes of detections.json, in order", found)
     kept = {i: box for i, box in enumerate(boxes) if box.name in FURNITURE}
     files = {i: find_mesh(result, i, box.name) for i, box in kept.items()}
     shapes = {path.name: read_shape(path) for path in files.values()}
     rows = [_object(i, box, files[i].name, shapes, floor) for i, box in kept.items()]
+
+    def load(at: At) -> tuple[Mesh, str]:  # as it is in the file
+        return mesh_of(*shapes[at.value], At(None, at.value)), str((result / at.value).resolve())
+
     return Parts(
         name=folder.resolve().name,
         camera=_camera(source, result / "r_ex.mat"),
         scene=scene_tree(rows, result.name, floor),
         objects=At(_annotations(items(at), list(kept)), "detections.json"),
-        load_mesh=partial(_load_mesh, result, shapes),
+        load_mesh=load,
         load_image=partial(read_image, At("img.jpg", "input"), source),
     )
-
-
-def _load_mesh(result: Path, shapes: Mapping[str, Shape], at: At) -> tuple[Mesh, str]:
-    """The mesh of an object, as it is in the file."""
-    return mesh_of(*shapes[at.value], At(None, at.value)), str((result / at.value).resolve())
 
 
 def _camera(source: Path, attitude: Path) -> At:
@@ -241,10 +237,7 @@ def _annotations(rows: Sequence[At], kept: Sequence[int]) -> dict[str, Any]:
 def _object(
     index: int, box: TotalBox, file: str, shapes: Mapping[str, Shape], floor: float
 ) -> dict[str, Any]:
-    """The fields of an object of scene.json; its mesh stays as it is in the file.
-
-    The bounds that are stretched to the box are those of all vertices, used or not.
-    """
+    """The fields of an object whose mesh is stretched by all its vertices, used or not."""
     verts: NDArray[np.float64] = shapes[file][0]
     low, high = verts.min(0), verts.max(0)
     if (high <= low).any():
