@@ -36,7 +36,7 @@ from mover_bench.experiment.paper_job import (
     named_contacts,
 )
 from mover_bench.experiment.paper_rows import TABLES
-from mover_bench.experiment.paper_table import paper_table
+from mover_bench.experiment.paper_table import paper_table, planned
 from mover_bench.experiment.run import Jobs
 from mover_bench.rooms.known import KnownRoom
 
@@ -221,6 +221,19 @@ def test_what_other_jobs_need_is_done_first_and_the_given_scene_needs_no_job(
     assert "PROX, given fits" not in page.read_text()
 
 
+def test_the_plan_counts_jobs_and_takes_the_time_of_those_that_have_ended(tmp_path: Path) -> None:
+    there = named_captures(tmp_path / "c", "vicon_03301")
+    args = TableArgs(
+        "prox-quantitative", there, tmp_path / "out", "paper", only=("initial", "full")
+    )
+    assert planned(args).startswith("2 jobs of 1 captures, 2 to do: about 0.2 h of one core")
+    few = replace(args, steps=100)
+    assert planned(few).startswith("2 jobs of 1 captures, 2 to do: about 0.0 h of one core")
+    paper_table(args, pool=Answers())
+    every = planned(replace(args, only=()))  # seven more hours, of jobs like `full`
+    assert "10 jobs of 1 captures, 8 to do: about 8.0 h of one core (as the 2" in every
+
+
 def test_lengths_have_the_spread_of_their_segments(tmp_path: Path) -> None:
     there = named_captures(tmp_path / "c", "MPH8_00034_01")
     args = TableArgs("prox", there, tmp_path / "out", only=("10 s",))
@@ -229,9 +242,14 @@ def test_lengths_have_the_spread_of_their_segments(tmp_path: Path) -> None:
     assert "| *10 s* (paper) | 0.389 | 0.018 |" in page
 
 
-def test_a_job_is_its_command_line_and_its_key_is_that_of_its_numbers(tmp_path: Path) -> None:
-    job = TableJob(tmp_path, tmp_path / "out", "paper", "full", "auto", "weights")
+def test_fewer_steps_are_other_jobs_of_the_same_command_line(tmp_path: Path) -> None:
+    job = TableJob(tmp_path, tmp_path / "out", "paper", "full", 50, "auto", "weights")
     assert TableJob.of(job.words) == job
+    assert (job.variant.config.layout.method.steps, job.variant.config.place.method.steps) == (
+        50,
+        50,
+    )
+    assert key_of(job) != key_of(replace(job, steps=0))
     assert key_of(job) != key_of(replace(job, preset="robust"))
     assert key_of(job) == key_of(replace(job, device="cpu", vposer=""))
     people = replace(job, name="people-sdf")

@@ -59,6 +59,8 @@ class TableArgs:
     """The same captures with boxes and masks of a detector (PointRend), for rows of their own."""
     only: tuple[str, ...] = ()
     """Rows whose names begin so, as initial full; empty: all."""
+    steps: Annotated[int, int_in(0, 1_000_000)] = 0
+    """At most so many steps of each descent; 0: as many as the preset has."""
     device: Literal["auto", "cpu", "cuda"] = "cpu"
     """Where the heavy stages compute: a GPU shortens the steps of `paper` and `printed`."""
     vposer: Path | None = None
@@ -87,8 +89,10 @@ def show_paper_table(arguments: Sequence[str]) -> None:
     """`mover paper-table`."""
     args = parsed(TableArgs, "mover paper-table", arguments)
     from mover.app.cli.progress import Bar
-    from mover_bench.experiment.paper_table import paper_table
+    from mover_bench.experiment.paper_table import paper_table, planned
 
+    if not args.look:
+        say(planned(args))
     with Bar() as bar:
         page = paper_table(args, bar)
     say(f"{page.read_text()}\ntable: {page}")

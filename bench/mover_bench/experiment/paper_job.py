@@ -33,7 +33,7 @@ from mover.pipeline.result import to_world
 from mover.stages.config import RefineBodiesConfig
 from mover.stages.people.refine_bodies import ABLATION, refine_bodies
 from mover_bench.experiment.measures import under_camera
-from mover_bench.experiment.paper_rows import BASELINE, FITS, INITIAL, PLAIN, variants
+from mover_bench.experiment.paper_rows import BASELINE, FITS, INITIAL, PLAIN, at_most, variants
 from mover_bench.experiment.variants import Variant, withheld
 
 DONE = "metrics.json"
@@ -52,6 +52,8 @@ class TableJob:
     preset: str
     name: str
     """A variant of `paper_rows.variants`."""
+    steps: int = 0
+    """At most so many steps of each descent; 0: as many as the preset has."""
     device: Choice = "cpu"
     vposer: str = ""
     """VPoser's weights: the bodies of the rows of people are fitted with them."""
@@ -59,15 +61,15 @@ class TableJob:
     @property
     def words(self) -> tuple[str, ...]:
         """The command line of its process."""
-        capture, out = str(self.capture), str(self.out)
-        return (capture, out, self.preset, self.name, self.device, self.vposer)
+        return (str(self.capture), str(self.out), self.preset, self.name, str(self.steps),
+                self.device, self.vposer)  # fmt: skip
 
     @staticmethod
     def of(words: Sequence[str]) -> "TableJob":
         """The inverse of `words`."""
-        capture, out, preset, name, device, vposer = words
+        capture, out, preset, name, steps, device, vposer = words
         choice: Any = device
-        return TableJob(Path(capture), Path(out), preset, name, choice, vposer)
+        return TableJob(Path(capture), Path(out), preset, name, int(steps), choice, vposer)
 
     @property
     def home(self) -> Path:
@@ -82,7 +84,7 @@ class TableJob:
     @property
     def variant(self) -> Variant:
         """Its settings."""
-        return variants(self.preset)[self.name]
+        return at_most(variants(self.preset)[self.name], self.steps)
 
 
 def key_of(job: TableJob) -> str:

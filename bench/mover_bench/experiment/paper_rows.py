@@ -7,7 +7,7 @@ on known rooms. None: not printed.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mover.pipeline.presets import PRESETS
 from mover_bench.datasets import pigraphs, prox_files
@@ -56,6 +56,17 @@ def variants(preset: str) -> dict[str, Variant]:
         **{name: Variant(config, cut=cut) for name, cut in cuts.items()},
         **{f"noise-{k}-{x:g}": Variant(config, change=f"{k}={x:g}") for k, x in noises},
     }
+
+
+def at_most(variant: Variant, steps: int) -> Variant:
+    """The same with at most so many steps of each descent; 0: as it is."""
+    config = variant.config
+    stages = {"layout": config.layout, "place": config.place}
+    fewer = {
+        name: replace(one, method=replace(one.method, steps=min(one.method.steps, steps)))
+        for name, one in stages.items()
+    }
+    return replace(variant, config=replace(config, **fewer)) if steps else variant
 
 
 ABLATION = (

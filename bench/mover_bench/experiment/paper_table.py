@@ -14,6 +14,7 @@ from pathlib import Path
 from mover.core.errors import InputError
 from mover.core.files import replacing
 from mover.core.observe import Observer, Step, silent
+from mover.energy.config import Adam
 from mover.pipeline.presets import PRESETS
 from mover_bench.cli import TableArgs
 from mover_bench.datasets import prox_files
@@ -23,6 +24,7 @@ from mover_bench.experiment.paper_rows import (
     BASELINE,
     ERRORS,
     FITS,
+    INITIAL,
     PLAIN,
     STD,
     TABLES,
@@ -41,6 +43,8 @@ SHORT = {
     "ground_penetration_frequency": "Freq.", "ground_penetration_distance": "Dist.",
     "pje": "PJE", "v2v": "V2V", "p_pje": "p.PJE", "p_v2v": "p.V2V",
 }  # fmt: skip
+FEW, JOB, STEP = 20.0, 60.0, 0.12
+"""[s] of one core: a job without a descent, one but for steps of Adam, and each of these steps."""
 Jobs = Mapping[TableRow, Sequence[TableJob]]
 
 
@@ -54,7 +58,7 @@ def paper_table(args: TableArgs, observe: Observer = silent, pool: Pool = run_ea
         InputError: If no capture has a truth, or the preset is none.
     """
     table, jobs = TABLES[args.table], all_jobs(args)
-    every = list(dict.fromkeys(job for found in jobs.values() for job in found))
+    every = _once(jobs)
     waiting = [] if args.look else [job for job in every if not is_finished(job)]
     for job in waiting:  # one without metrics.json has failed, and the page says so
         (job.folder / DONE).unlink(missing_ok=True)
@@ -84,6 +88,36 @@ def all_jobs(args: TableArgs) -> Jobs:
     return {row: found for row, found in jobs.items() if found or not row.job.startswith(FITS)}
 
 
+def _once(jobs: Jobs) -> list[TableJob]:
+    return list(dict.fromkeys(job for found in jobs.values() for job in found))
+
+
+def planned(args: TableArgs) -> str:
+    """How many jobs there are, and about how long they take: as those that have ended, if any."""
+    every = _once(all_jobs(args))
+    waiting = [job for job in every if not is_finished(job)]
+    known = [read_numbers(job.folder / DONE).get("seconds") for job in every if job not in waiting]
+    times = [seconds for seconds in known if seconds is not None and seconds > FEW]
+    usual = statistics.mean(times) if times else None
+    hours = sum(_seconds(job, usual) for job in waiting) / 3600
+    basis = f"as the {len(times)} that have ended" if times else "as on an eight-object room"
+    return (
+        f"{len(every)} jobs of {len({job.capture for job in every})} captures, {len(waiting)} to"
+        f" do: about {hours:.1f} h of one core ({basis}); a GPU shortens Adam's steps alone"
+    )
+
+
+def _seconds(job: TableJob, usual: float | None) -> float:
+    """About how long a job takes on one core."""
+    if job.name == INITIAL or job.name.startswith(FITS):
+        return FEW
+    if usual is not None:
+        return usual
+    config = job.variant.config
+    methods = (config.layout.method, config.place.method)
+    return JOB + STEP * sum(m.steps for m in methods if isinstance(m, Adam))
+
+
 def asked(part: Part, args: TableArgs) -> list[TableRow]:
     """Our rows of a table that are made."""
     return [
@@ -104,7 +138,7 @@ def jobs_of(row: TableRow, args: TableArgs) -> list[TableJob]:
     out = args.results / "detected" if row.detected else args.results
     vposer = "" if args.vposer is None else str(args.vposer)
     found = [
-        TableJob(path.parent.parent, out, args.preset, name, args.device, vposer)
+        TableJob(path.parent.parent, out, args.preset, name, args.steps, args.device, vposer)
         for path in sorted(captures.glob("*/truth/scene.json"))
         if belongs(path.parent.parent.name, args.table)
         for name in names
@@ -131,6 +165,7 @@ def write_page(table: PaperTable, jobs: Jobs, args: TableArgs) -> Path:
     pictures = sum(1 for home in captures for _ in home.glob("frames/*"))
     have = f"here {len(captures)} of {table.count} captures, with {pictures} pictures"
     lines = [f"# {table.title}", f"The paper has {table.expected}; {have}."]
+    lines += [f"At most {args.steps} steps of each descent."] if args.steps else []
     numbers: list[dict[str, str]] = []
     for part in table.parts:
         rows = [row for row in asked(part, args) if row in jobs]
