@@ -1,12 +1,9 @@
 import sys
 from importlib.machinery import PathFinder
 
-import jaxtyping
 import pytest
-import shape_checks
 import torch
 
-jaxtyping.jaxtyped = shape_checks.late  # what the hook of --jaxtyping-packages puts around all
 torch.set_num_threads(1)  # threads that wait for one another are slower than one
 
 
