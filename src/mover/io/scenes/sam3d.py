@@ -90,7 +90,7 @@ def sam3d_parts(folder: Path, hints: Hints) -> Parts:
 
 
 def _things(folder: Path) -> tuple[list[Path], list[str]]:
-    """The meshes of a folder that have a pose, by number or name, and what is passed over."""
+    """The meshes of a folder, by number or name, and what is passed over."""
     kinds = {kind: rank for rank, kind in enumerate(KINDS)}
     paths = [path for path in folder.iterdir() if path.suffix.lower() in kinds]
     paths = [path for path in paths if not path.stem.lower().startswith(PEOPLE)]
@@ -99,8 +99,7 @@ def _things(folder: Path) -> tuple[list[Path], list[str]]:
     clouds = [path for path in paths if is_cloud(path)]
     meshes = [path for path in paths if path not in clouds]
     once = [p for k, p in enumerate(meshes) if p.stem not in [other.stem for other in meshes[:k]]]
-    posed = [p for p in once if any(p.with_suffix(kind).is_file() for kind in POSES)] or once
-    if not posed:
+    if not once:
         found = f"{len(clouds)} files of points or splats, " if clouds else ""
         wanted = "expected <name>.glb with <name>.npz or .json"
         raise InputError(f"{folder}: has {found}no meshes, {wanted}")
@@ -109,11 +108,10 @@ def _things(folder: Path) -> tuple[list[Path], list[str]]:
         for passed, why in (
             (clouds, "of points without faces, as Gaussian splats are"),
             ([p for p in meshes if p not in once], "of the name of another mesh"),
-            ([p for p in once if p not in posed], "without a pose beside it"),
         )
         if passed
     ]
-    return posed, notes
+    return once, notes
 
 
 def _pose_beside(path: Path) -> At:
