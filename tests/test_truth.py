@@ -19,7 +19,7 @@ from mover.io.capture.scene_file import write_scene
 from mover.pipeline import objects as steps
 from mover.pipeline.people import estimate_people
 from mover.pipeline.presets import PRESETS
-from mover.stages.contacts.assign_contacts import assign_contacts
+from mover.stages.contacts.assign_contacts import LONG, assign_contacts
 from mover.stages.contacts.contact_association import AssignInputs
 from mover.stages.contacts.gather_cues import cues_in_windows
 from mover.stages.objects.find_image_cues import ImageInputs, find_image_cues, image_evidence
@@ -113,7 +113,14 @@ def test_seated_people_observe_the_front_of_seats_with_backs_and_lying_people_th
         CONFIG.assign,
     )  # fmt: skip
     assert found.points is not None
-    torch.testing.assert_close(found.points.heading, touches.heading * bed[:, None])
+    torch.testing.assert_close(found.points.heading[bed], touches.heading[bed])
+    width, _, depth = objects.size[touches.object_of].unbind(-1)
+    ratio = torch.maximum(width / depth, depth / width)
+    long = ~bed & (ratio > LONG)  # without a back people sit across the long side of it
+    assert not bool(found.points.heading[~bed & ~long].any())
+    assert bool(found.points.across[long].all())
+    across = (found.points.heading * touches.heading).sum(-1)[long & observed & (width > depth)]
+    assert float(across.abs().max()) < np.sin(np.radians(20))
 
 
 @pytest.mark.slow

@@ -206,11 +206,11 @@ def _values(
         if "pitch_error" in tree:
             tree.setdefault("mean_tilt", (tree["pitch_error"] + tree["roll_error"]) / 2)
     values: dict[str, float] = {"recordings": len({j.capture for j, tree in trees.items() if tree})}
+    full = {job: tree for job, tree in trees.items() if "full" in tree}
     spreads = [
         statistics.stdev(known)
         for home in dict.fromkeys(job.capture for job in jobs)
-        if len(known := [t["full"]["iou3d"] for j, t in trees.items() if t and j.capture == home])
-        > 1
+        if len(known := [t["full"]["iou3d"] for j, t in full.items() if j.capture == home]) > 1
     ]
     if STD in part.columns and spreads:
         values[STD] = _scale(STD, table) * statistics.mean(spreads)
