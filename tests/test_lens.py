@@ -45,18 +45,12 @@ def camera_of(focal: float, pitch: float = -0.2, roll: float = 0.02) -> Camera:
     return Camera(K, tilted(torch.tensor(pitch), torch.tensor(roll)), W, H)
 
 
-def drawn(
-    heading: float, seed: int, boxes: int = 9, askew: int = 0, only: int | None = None,
-    off: tuple[float, float] = (0.0, 0.0),
-):  # fmt: skip
+def drawn(heading: float, seed: int, **boxes: int):
     """A picture of boxes by OpenCV's pencil: a maker that shares nothing with the method."""
-    return boxes_drawn(heading, seed, boxes, askew, only, off)[0]
+    return boxes_drawn(heading, seed, **boxes)[0]
 
 
-def boxes_drawn(
-    heading: float, seed: int, boxes: int = 9, askew: int = 0, only: int | None = None,
-    off: tuple[float, float] = (0.0, 0.0), *, solid: bool = False,
-):  # fmt: skip
+def boxes_drawn(heading, seed, boxes=9, askew=0, only=None, off=(0.0, 0.0), solid=False):
     """The picture of boxes' edges and their masks; solid ones hide each other."""
     rng, camera = np.random.default_rng(seed), camera_of(FOCAL)
     picture = np.full((H, W, 3), 235, np.uint8)

@@ -115,8 +115,7 @@ def test_seated_people_observe_the_front_of_seats_with_backs_and_lying_people_th
     assert found.points is not None
     torch.testing.assert_close(found.points.heading[bed], touches.heading[bed])
     width, _, depth = objects.size[touches.object_of].unbind(-1)
-    ratio = torch.maximum(width / depth, depth / width)
-    long = ~bed & (ratio > LONG)  # without a back people sit across the long side of it
+    long = ~bed & (torch.maximum(width / depth, depth / width) > LONG)  # sat on across that
     assert not bool(found.points.heading[~bed & ~long].any())
     assert bool(found.points.across[long].all())
     across = (found.points.heading * touches.heading).sum(-1)[long & observed & (width > depth)]

@@ -6,7 +6,6 @@ of all rooms: people are as tall as people are, furniture as large as its class;
 along a wall; skin rests on seats and soles on the floor; furniture covers its outline.
 """
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -19,9 +18,8 @@ from mover.app.cli.video import VideoArgs, video_to_room
 from mover.bodies.keypoints import keypoints_of
 from mover.bodies.parts import BodyParts, members, parts_of
 from mover.bodies.posture import postures
-from mover.bodies.skinning import heights_of, open_body
+from mover.bodies.skinning import open_body
 from mover.core.errors import InputError
-from mover.core.files import replacing
 from mover.core.observe import Observer, Step, silent
 from mover.core.types import Bodies, Scene, SceneObject
 from mover.furniture.library import SEATS, STANDARD, canonical
@@ -36,7 +34,7 @@ from mover.io.people.keypoints import read_keypoints
 from mover.perceive.capture import read_picture_of
 from mover.perceive.layout import Picture
 from mover_bench.cli import ExperimentArgs
-from mover_bench.experiment.tables import markdown
+from mover_bench.experiment.tables import markdown, stature, write_summary
 
 VIEW = 65.0  # [degrees], horizontal, of a clip whose lens was not measured
 STEP_UP = 0.15  # [m] that a seat may reach into its sitter and still be below
@@ -70,11 +68,7 @@ def judge_clips(args: ExperimentArgs, observe: Observer = silent) -> Path:
             objects=clip / "furniture.json", preset=args.variants[0],
         ))  # fmt: skip
         found[clip.name] = judge_room(out / clip.name)
-    with replacing(out / "summary.json") as part:
-        part.write_text(json.dumps(found, indent=1))
-    with replacing(out / "summary.md") as part:
-        part.write_text(table_of(found))
-    return out / "summary.md"
+    return write_summary(out, found, table_of(found))
 
 
 def table_of(found: dict[str, dict[str, Any]]) -> str:
@@ -94,14 +88,10 @@ def judge_room(folder: Path) -> dict[str, Any]:
     soles = bodies.verts[:, members(parts, "left_sole", "right_sole"), 1].amin(1)
     on_feet = pose.standing | pose.sitting
     off = 100 * (soles[on_feet] - (scene.ground or 0.0))
-    usual, growth = heights_of(open_body())
-    stature = None
-    if bodies.pose is not None:
-        betas = bodies.pose.betas[0]
-        stature = round(usual + float(betas @ growth[: len(betas)]), 3)
+    tall = None if bodies.pose is None else round(stature(bodies.pose.betas[0]), 3)
     rows = [row_of(thing, scene, picture, bodies, parts) for thing in scene.objects]
     return {
-        "stature": stature, "miss": miss_of(capture, stature or usual),
+        "stature": tall, "miss": miss_of(capture, tall or stature(torch.zeros(1))),
         "sole": round(float(off.abs().median()), 1) if len(off) else None, "objects": rows,
     }  # fmt: skip
 

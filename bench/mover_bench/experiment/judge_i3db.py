@@ -1,6 +1,5 @@
 """Measure the method on i3DB: from library furniture, from the true shapes, beside iMapper."""
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,9 +9,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from mover.bodies.skinning import heights_of, open_body
+from mover.bodies.skinning import open_body
 from mover.core.errors import InputError
-from mover.core.files import replacing
 from mover.core.observe import Observer, Step, silent
 from mover.core.run import Run
 from mover.core.types import Bodies, Camera, Capture, Scene, SceneObject
@@ -29,7 +27,7 @@ from mover.pipeline.presets import PRESETS
 from mover.pipeline.reconstruct import reconstruct
 from mover_bench.cli import ExperimentArgs
 from mover_bench.datasets.i3db import I3dbScene, read_i3db
-from mover_bench.experiment.tables import markdown
+from mover_bench.experiment.tables import markdown, stature, write_summary
 
 LEVEL = tilted(torch.tensor(0.0), torch.tensor(0.0))
 POINTS = 1  # of surfaces, which are not compared
@@ -58,11 +56,7 @@ def judge_i3db(args: ExperimentArgs, observe: Observer = silent) -> Path:
     for done, folder in enumerate(folders):
         observe(Step(f"i3db {folder.name}", done, len(folders)))
         found[folder.name] = judge_scene(read_i3db(folder), Run(out / folder.name), preset)
-    with replacing(out / "summary.json") as part:
-        part.write_text(json.dumps(found, indent=1))
-    with replacing(out / "summary.md") as part:
-        part.write_text(table_of(found))
-    return out / "summary.md"
+    return write_summary(out, found, table_of(found))
 
 
 COLUMNS = {
@@ -86,11 +80,10 @@ def judge_scene(scene: I3dbScene, run: Run, preset: str) -> dict[str, Any]:
     camera = replace(scene.truth.camera, R_cam_world=LEVEL)  # its tilt is not given
     model = open_body()
     bodies = fit_bodies(FitInputs(scene.keypoints, camera, model)).bodies
-    usual, growth = heights_of(model)
     assert bodies.pose is not None
     first = first_scene(seen_from(picture_of(scene, camera), bodies, run), LayoutConfig(), run)
     numbers: dict[str, Any] = {
-        "stature": usual + float(bodies.pose.betas[0] @ growth[: bodies.pose.betas.shape[1]]),
+        "stature": stature(bodies.pose.betas[0]),
         **overlaps("first", first.scene.objects, scene),
         **overlaps("imapper", by_kind(scene.imapper, scene.truth.objects), scene),
     }

@@ -1,5 +1,6 @@
 """The tables of an experiment: every object, the means, and a page that one can read."""
 
+import json
 import os
 import platform
 from collections.abc import Iterable, Mapping, Sequence
@@ -10,8 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from mover.app.report.tables import SHOWN, shown
+from mover.bodies.skinning import heights_of, open_body
 from mover.core.files import replacing
 from mover.core.records import plain
 from mover.evaluate.evaluation import METRICS
@@ -46,6 +49,20 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table: the first column on the left, the others on the right."""
     rule = ["---", *["--:"] * (len(head) - 1)]
     return "\n".join("| " + " | ".join(row) + " |" for row in (head, rule, *rows))
+
+
+def write_summary(folder: Path, found: Mapping[str, Any], text: str) -> Path:
+    """Write summary.json and summary.md of a set of real data; returns the latter."""
+    for name, content in (("summary.json", json.dumps(found, indent=1)), ("summary.md", text)):
+        with replacing(folder / name) as part:
+            part.write_text(content)
+    return folder / "summary.md"
+
+
+def stature(betas: Float[Tensor, " shape"]) -> float:
+    """How tall the open body of a shape is [m]."""
+    usual, growth = heights_of(open_body())
+    return usual + float(betas @ growth[: len(betas)])
 
 
 class Interval(NamedTuple):

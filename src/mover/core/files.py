@@ -50,14 +50,19 @@ def copy_whole(source: Path, target: Path) -> None:
         shutil.copyfile(source, part)
 
 
-def reason(error: Exception, path: Path | None = None) -> str:
-    """Why a file cannot be read, in one short line without Python's own words."""
-    if path is not None and path.is_file():
+def instead(path: Path) -> str:
+    """What a file is in place of what was expected; empty: nothing that is known."""
+    if path.is_file():
         with suppress(OSError), path.open("rb") as file:
             head = file.read(64)
-            for start, words in INSTEAD.items():
-                if re.match(start, head, re.IGNORECASE):
-                    return words
+            return next((w for start, w in INSTEAD.items() if re.match(start, head, re.I)), "")
+    return ""
+
+
+def reason(error: Exception, path: Path | None = None) -> str:
+    """Why a file cannot be read, in one short line without Python's own words."""
+    if path is not None and (found := instead(path)):
+        return found
     if isinstance(error, UnicodeError):
         return "it is no text in UTF-8"
     if isinstance(error, OSError) and error.strerror:

@@ -18,6 +18,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from mover.bodies.keypoints import LAYOUTS
+from mover.bodies.skeleton import SIDES
 from mover.core.errors import InputError
 from mover.core.observe import Observer
 from mover.core.records import fingerprint
@@ -53,7 +54,6 @@ from mover.stages.config import LensConfig
 log = logging.getLogger(__name__)
 BEND, OFTEN = 0.15, 0.9  # of the height: second difference of the trunk, and of how many frames
 DENSEST = 20.0  # frames a second
-SIDES = ("left", "right")
 CHUNK = 50  # frames whose detections are kept together
 # How far off a focal length may be, of its logarithm; what a file gives stays as it is.
 BY_EXIF = 0.05  # of a photo, while a video is cut by what steadies it

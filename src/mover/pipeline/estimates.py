@@ -17,7 +17,7 @@ from mover.stages.people.find_depth import pelvis
 
 ODD = 2.5  # standard deviations from the population or a standard, from which there is a warning
 POOR = 0.025  # of a person's height: keypoints that a fit misses by more
-LOOSE = 0.02  # spread of a logarithm from which on there is a cure
+LOOSE = 0.02  # spread of the logarithm of a focal length, or of a room's size: worth a cure
 AXES = ("wide", "high", "deep")
 
 

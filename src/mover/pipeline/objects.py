@@ -16,6 +16,7 @@ from mover.energy.objective import HumanCues, ImageCues
 from mover.geometry.camera import to_camera
 from mover.geometry.path import scaled
 from mover.geometry.placement import larger, place, reproject, rest_on_support
+from mover.pipeline.estimates import LOOSE
 from mover.pipeline.people import HIGHEST, Located, lines_of
 from mover.pipeline.presets import Config, with_sizes
 from mover.stages.camera.refine_camera import RefineInputs, refine_camera
@@ -58,7 +59,6 @@ from mover.stages.objects.starts import best_few, other_starts, reference_yaw, t
 from mover.stages.people.find_depth import are_shapeless, nearer, pelvis, size_spread
 
 NO_PEOPLE = HumanCues()
-LOOSE_SCALE = 0.02  # of the logarithm of a room's size: a spread that deserves a warning
 
 
 @dataclass(frozen=True)
@@ -228,7 +228,7 @@ def estimate_scale(
     scale, left = common_scale(placed.layout, given, setup.objects.categories, prior)
     factor = math.exp(-scale)
     warnings = people.warnings
-    if left > LOOSE_SCALE:
+    if left > LOOSE:
         warnings += (
             f"people's heights are not known, so the size of the whole room is uncertain by"
             f" {100 * left:.0f} %: the height of a person (mover fit --height, or 'heights' in"

@@ -121,7 +121,7 @@ def main() -> None:
     logging.getLogger("mover.geometry.kernels").setLevel(logging.INFO)  # what is compiled, once
     code = run_command(arguments[0], arguments[1:])
     if code == INTERRUPTED:
-        os._exit(code)  # stages that are computed beside others would be waited for
+        os._exit(code)  # work of other threads would be waited for
     raise SystemExit(code)
 
 

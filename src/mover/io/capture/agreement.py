@@ -142,11 +142,24 @@ def _overlaps(capture: Capture) -> Float[Tensor, " annotated"]:
     ours = in_image(outlines(objects, capture.scene.camera), capture.scene.camera)
     if known:
         return iou2d(ours[list(known)], torch.stack(list(known.values())))
+    shared = pairwise_iou2d(ours, torch.stack(list(boxes.values())))
+    return torch.stack([shared[pair] for pair in assigned(shared)])
+
+
+def pairwise_iou2d(
+    a: Float[Tensor, "rows 4"], b: Float[Tensor, "columns 4"]
+) -> Float[Tensor, "rows columns"]:
+    """`iou2d` of each box with each other one."""
+    return iou2d(*torch.broadcast_tensors(a[:, None], b[None]))
+
+
+def assigned(shared: Float[Tensor, "rows columns"], least: float = 0.0) -> list[tuple[int, int]]:
+    """Pairs of a row and a column with the greatest sum, of those that share enough."""
     from scipy.optimize import linear_sum_assignment
 
-    shared = iou2d(*torch.broadcast_tensors(ours[:, None], torch.stack(list(boxes.values()))))
     rows, columns = linear_sum_assignment(shared.numpy(), maximize=True)
-    return shared[rows, columns]
+    pairs = zip(rows.tolist(), columns.tolist(), strict=True)
+    return [(i, j) for i, j in pairs if shared[i, j] >= least]
 
 
 def outlines(objects: Sequence[SceneObject], camera: Camera) -> Float[Tensor, "objects 4"]:

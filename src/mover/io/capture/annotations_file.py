@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mover.core.types import Camera, Detection, Masks, People
 from mover.geometry.boxes import iou2d
-from mover.geometry.rle import area, decode, joined, tight_box
+from mover.geometry.rle import area, joined, mask_boxes
 from mover.io.files.fields import At, Warn, get, items, listed, maybe, plain, refuse, shown, unique
 from mover.io.files.schema import Box, FrameRate, Id, Index, Share, checked
 from mover.io.masks.coco import (
@@ -93,7 +93,7 @@ def _check_mask(at: At, mask: Masks, box: Float[Tensor, "4"], warn: Warn) -> Non
     """Refuse an empty mask, warn of one that is elsewhere than its box."""
     if not area(mask, 0):
         refuse(get(at, "segmentation"), "a mask with pixels", "an empty mask")
-    if iou2d(box, tight_box(decode(mask, 0))) < LEAST_OVERLAP:
+    if iou2d(box, mask_boxes(mask)[0]) < LEAST_OVERLAP:
         warn(f"{at.place} has a box and a mask in different places")
 
 

@@ -26,8 +26,10 @@ from mover.io.capture.agreement import (
     SCORES,
     Agreement,
     agreement,
+    assigned,
     in_image,
     outlines,
+    pairwise_iou2d,
     partners,
     thinned_capture,
 )
@@ -90,14 +92,16 @@ def check_against_picture(capture: Capture) -> Findings:
         best, least = None, 0.0
         for fault in hypotheses(thin, found):
             other = fault.mend(thin)
-            gain = _gain(found, agreement(other, (thin, found))) - fault.margin
-            if other is not thin and gain > least:
-                best, least = fault, gain
+            if other is thin:
+                continue
+            better = agreement(other, (thin, found))
+            gain = _gain(found, better) - fault.margin
+            if gain > least:
+                best, least = (fault, other, better), gain
         if best is None:
             break
-        thin = best.mend(thin)
-        found = agreement(thin)
-        faults.append(best)
+        fault, thin, found = best
+        faults.append(fault)
     return Findings(own, tuple(faults), tuple(_unexplained(found)))
 
 
@@ -258,9 +262,9 @@ def _annotations(capture: Capture, found: Agreement) -> Iterator[Fault]:
     ours = in_image(ours, capture.scene.camera)
     some = [capture.scene.objects[i] for i in known]
     kinds = [canonical(one.category) for one in some]
-    shared = iou2d(*torch.broadcast_tensors(ours[:, None], theirs[None]))
+    shared = pairwise_iou2d(ours, theirs)
     shared = shared * torch.tensor([[float(a == b) for b in kinds] for a in kinds])
-    pairs = mends.assigned(shared, POOR) if len(some) > 1 else []
+    pairs = assigned(shared, POOR) if len(some) > 1 else []
     new = {some[i].id: some[j].annotation for i, j in pairs if i != j}
     if new and set(new.values()) == {one.annotation for one in some if one.id in new}:
         text = ", ".join(f"{name} has {number}" for name, number in new.items())

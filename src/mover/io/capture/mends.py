@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mover.core.types import Camera, Capture, Detection, Masks, SceneObject, Segment
 from mover.geometry.camera import pitch_roll, tilted
-from mover.geometry.rle import decode, run_lengths, tight_box
+from mover.geometry.rle import area, mask_boxes, run_lengths
 from mover.io.capture.tracks import pair_tracks, paired
 
 Mend = Callable[[Capture], Capture]
@@ -141,9 +141,9 @@ def inverted_objects(capture: Capture) -> Capture:
 
     def other(one: Detection) -> Detection:
         mask = None if one.mask is None else _inverted(one.mask)
-        if mask is None or not run_lengths(mask.counts[0])[1::2].sum():
+        if mask is None or not area(mask, 0):
             return one
-        return replace(one, mask=mask, box=tight_box(decode(mask, 0)).to(one.box))
+        return replace(one, mask=mask, box=mask_boxes(mask)[0].to(one.box))
 
     return replace(capture, detections=tuple(map(other, capture.detections)))
 
@@ -168,12 +168,3 @@ def same_tracks(capture: Capture) -> Capture:
     pairs = pair_tracks(bodies, seen, capture.scene.camera)
     bodies, seen = paired(bodies, seen, pairs)
     return replace(capture, bodies=bodies, people=seen) if pairs.notes else capture
-
-
-def assigned(shared: Float[Tensor, "rows columns"], least: float) -> list[tuple[int, int]]:
-    """Pairs with the greatest sum, of those that share enough."""
-    from scipy.optimize import linear_sum_assignment
-
-    rows, columns = linear_sum_assignment(shared.numpy(), maximize=True)
-    pairs = zip(rows.tolist(), columns.tolist(), strict=True)
-    return [(i, j) for i, j in pairs if shared[i, j] >= least]

@@ -8,8 +8,13 @@ import torch
 
 from mover.core.types import Scene
 from mover.furniture.library import canonical
-from mover.geometry.boxes import iou2d
-from mover.io.capture.agreement import in_image, outermost, outlines
+from mover.io.capture.agreement import (
+    assigned,
+    in_image,
+    outermost,
+    outlines,
+    pairwise_iou2d,
+)
 from mover.io.capture.parts import UNKNOWN
 from mover.io.files.fields import At, get, items
 
@@ -34,20 +39,16 @@ def pair_rows(ours: Sequence[Row], theirs: Sequence[Row]) -> dict[int, int]:
     Returns:
         Index in `theirs` by index in `ours`.
     """
-    from scipy.optimize import linear_sum_assignment
-
     if not ours or not theirs:
         return {}
     boxes = [np.array([row["bbox"] for row in side], dtype=np.float64) for side in (ours, theirs)]
     a, b = (torch.from_numpy(box + np.pad(box[:, :2], ((0, 0), (2, 0)))) for box in boxes)
-    shared = iou2d(*torch.broadcast_tensors(a[:, None], b[None])).numpy()
+    shared = pairwise_iou2d(a, b).numpy()
     names, others = ([row["category_id"] for row in side] for side in (ours, theirs))
     same = np.array([[UNKNOWN in (x, y) or canonical(x) == canonical(y) for y in others]
                      for x in names])  # fmt: skip
     gain = np.where(shared >= np.where(same, LEAST, OTHER_CLASS), shared + same, 0.0)
-    rows, columns = linear_sum_assignment(gain, maximize=True)
-    chosen = zip(rows.tolist(), columns.tolist(), strict=True)
-    return {i: j for i, j in chosen if gain[i, j] > 0}
+    return dict(assigned(torch.from_numpy(gain), LEAST))
 
 
 def linked(scene: Scene, at: At) -> dict[str, int]:

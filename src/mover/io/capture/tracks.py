@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mover.core.types import Bodies, Camera, People
-from mover.geometry.boxes import iou2d
 from mover.geometry.camera import NEAR
 from mover.geometry.rle import mask_boxes
-from mover.io.capture.agreement import box_around, in_image
+from mover.io.capture.agreement import box_around, in_image, pairwise_iou2d
 
 OVERLAP = 0.5  # of a body and a mask of one person, mean of share and union
 CLEAR = 0.3  # by so much the next best pair is worse where there is no uncertainty
@@ -125,9 +124,9 @@ def _overlaps(
     ours: Float[Tensor, "bodies 4"], theirs: Float[Tensor, "masks 4"]
 ) -> NDArray[np.float64]:
     """How well each body fits each mask: the share of the mask's box inside, and the union."""
-    a, b = torch.broadcast_tensors(ours[:, None], theirs[None])
-    shared, (first, second) = iou2d(a, b), ((x[..., 2:] - x[..., :2]).prod(-1) for x in (a, b))
-    common = shared * (first + second) / (1 + shared)
+    shared = pairwise_iou2d(ours, theirs)
+    first, second = ((x[:, 2:] - x[:, :2]).prod(-1) for x in (ours, theirs))
+    common = shared * (first[:, None] + second) / (1 + shared)
     return ((common / second.clamp_min(1e-9) + shared) / 2).numpy()
 
 

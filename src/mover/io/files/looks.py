@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
-from mover.io.files.fields import At, reason, refuse, shown
+from mover.core.files import instead, reason
+from mover.io.files.fields import At, refuse, shown
 
 MOST_NUMBERS = 1 << 27  # in one array of a glTF file
 MOST_ZEROS = 1 << 20  # in one that has no bytes in the file
@@ -26,11 +27,6 @@ MOST_NODES = 10_000
 MOST_FACES = 5_000_000  # of all places of all meshes together: 8 s and 1.5 GB
 MOST_MATERIALS = 500  # of an .obj
 PACKED = {"KHR_draco_mesh_compression": "Draco", "EXT_meshopt_compression": "meshopt"}
-DISGUISES = {
-    b"version https://git-lfs": "a pointer of Git LFS, not the file (git lfs pull brings it)",
-    b"<!doctype html": "a web page that was saved in its place (download the file itself)",
-    b"<html": "a web page that was saved in its place (download the file itself)",
-}
 NUMBERED = {"-o": 3, "-s": 3, "-t": 3, "-mm": 2}
 """Options of a texture with up to so many numbers; all others have one word."""
 
@@ -72,25 +68,19 @@ def load_parts(at: At, path: Path, *, looks: bool = True, process: bool = False)
         except InputError:
             raise
         except Exception as error:  # the parsers of six formats raise anything on broken files
-            said = _disguise(path) or f"which cannot be read ({reason(error)})"
-            refuse(at, "a readable mesh", f"{at.value!r}, {said}")
+            why = reason(error, path)
+            refuse(at, "a readable mesh", f"{at.value!r}, which cannot be read ({why})")
     bare = {n: part for n, part in scene.geometry.items() if not len(getattr(part, "faces", ()))}
     if len(bare) == len(scene.geometry):
         count = sum(len(part.vertices) for part in bare.values())
         points = f"{count} points without faces (a cloud of points, or Gaussian splats)"
-        said = _disguise(path) or f"an empty mesh{': ' * bool(count)}{points * bool(count)}"
+        said = f"an empty mesh{': ' * bool(count)}{points * bool(count)}"
+        if found := instead(path):
+            said = f"which cannot be read: {found}"
         refuse(at, "a mesh with faces", f"{at.value!r}, {said}")
     if bare:
         scene.delete_geometry(list(bare))
     return scene
-
-
-def _disguise(path: Path) -> str:
-    """What lies in a file in place of a mesh; empty: nothing that is known."""
-    with path.open("rb") as file:
-        start = file.read(64).lstrip().lower()
-    return next((f"which is {what}" for mark, what in DISGUISES.items() if start.startswith(mark)),
-                "" if start else "which cannot be read: it is empty")  # fmt: skip
 
 
 def is_cloud(path: Path) -> bool:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mover.core.errors import InputError
 from mover.core.types import Masks
 from mover.furniture.library import plain_name, unknown_names
-from mover.geometry.rle import area, decode, encode
+from mover.geometry.rle import area, decode, encode, mask_boxes
 from mover.io.capture.parts import UNKNOWN
 from mover.io.files.fields import LAST_INDEX, At, listed, read_json, refuse
 from mover.io.masks.coco import annotations_tree, from_coco, is_drawn, segmentation
@@ -234,11 +234,7 @@ def _box_of(item: Instance, size: Size | None) -> Sequence[float]:
     """The box of an instance: that of its mask where it has one [px]."""
     if item.mask is None or size is None:
         return item.box or (0.0, 0.0, 0.0, 0.0)
-    from pycocotools import mask as coco
-
-    code: Any = {"size": [size[1], size[0]], "counts": item.mask}
-    x, y, w, h = coco.toBbox(code).tolist()  # pyright: ignore
-    return x, y, x + w, y + h
+    return mask_boxes(Masks(size[1], size[0], (item.mask,)))[0].tolist()
 
 
 def with_reference_people(people: At | None, found: Instances, folder: Path) -> At:

@@ -206,7 +206,8 @@ def _turned(segments: Segments, pose: RoomPose) -> RoomPose:
     none = torch.zeros_like(pose.askew)
     costs: list[Tensor] = []
     for turn in tried:
-        total = _likelihood(segments, replace(pose, askew=none + turn), COARSE[0])[0]
+        angle = sines(segments, replace(pose, askew=none + turn))
+        total, _ = _likelihood(segments, angle, COARSE[0])
         cost = none.index_add(1, segments.group, -segments.vote * total.log())
         costs.append(cost + _off_axes(none + turn)[0])
     askew = tried[torch.stack(costs).argmin(0)]
@@ -250,11 +251,11 @@ def _moved(pose: RoomPose, step: Float[Tensor, "starts unknowns"]) -> RoomPose:
 
 
 def _likelihood(
-    segments: Segments, pose: RoomPose, coarse: float
+    segments: Segments, angle: Float[Tensor, "starts 3 lines"], coarse: float
 ) -> tuple[Float[Tensor, "starts lines"], Float[Tensor, "starts 3 lines"]]:
     """Density of each segment's angle, and the part of each direction."""
     sigma = coarse * segments.error
-    e = sines(segments, pose) / sigma
+    e = angle / sigma
     within = (1 - FREE) / 3 * (-0.5 * e.square()).exp() / (sigma * (2 * torch.pi) ** 0.5)
     return within.sum(1) + FREE / torch.pi, within
 
@@ -283,7 +284,7 @@ def _quadratic(
     each group.
     """
     angle, each = sines_and_slopes(segments, pose)
-    total, within = _likelihood(segments, pose, coarse)
+    total, within = _likelihood(segments, angle, coarse)
     weight = segments.vote * within / total[:, None] / (coarse * segments.error).square()
     groups = torch.nn.functional.one_hot(segments.group, pose.askew.shape[1]).to(angle)
     groups[:, 0] = 0  # the room itself has the heading of the room
@@ -326,11 +327,11 @@ def _lean(
 
 def sines(segments: Segments, pose: RoomPose) -> Float[Tensor, "starts 3 lines"]:
     """Sine of the angle between each segment and the way to each vanishing point."""
-    return sines_and_slopes(segments, pose, sloped=False)[0]
+    return sines_and_slopes(segments, pose)[0]
 
 
 def sines_and_slopes(
-    segments: Segments, pose: RoomPose, *, sloped: bool = True
+    segments: Segments, pose: RoomPose
 ) -> tuple[Float[Tensor, "starts 3 lines"], Float[Tensor, "starts 3 lines unknowns"]]:
     """`sines`, and their slopes by the unknowns of each segment.
 
@@ -344,8 +345,6 @@ def sines_and_slopes(
     norm = q.square().sum(-1).clamp_min(1e-9).sqrt()
     across = torch.stack([-d[:, 1], d[:, 0]], -1)
     sine = (across * q).sum(-1) / norm
-    if not sloped:
-        return sine, sine.new_zeros(*sine.shape, 0)
     by_q = (across - (sine / norm)[..., None] * q) / norm[..., None]
     up = pose.R_cam_room[:, None, None, :, 1]
     axes = [*torch.eye(3).to(v), up]
