@@ -8,8 +8,7 @@ from pathlib import Path
 
 import torch
 
-from mover.app.pictures.overlay import draw_overlay
-from mover.core.types import Mesh
+from mover.app.pictures.paint import draw_picture, furniture, joined, people
 from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.scene_file import read_scene
 from mover.io.formats import read
@@ -26,7 +25,10 @@ def main(demo: Path, picture: Path) -> None:
     after = read_bodies(demo / "room" / "bodies.npz")
     columns = [
         torch.cat([
-            draw_overlay(capture.reference, scene, Mesh(b.verts[int(k * len(b.frame))], b.faces))
+            draw_picture(
+                joined([furniture(scene), people(b, [int(k * len(b.frame))])]),
+                scene.camera, capture.reference, scene.ground,
+            )[0]
             for k in SHOWN
         ])
         for scene, b in ((capture.scene, before), (result, after))
