@@ -1,5 +1,4 @@
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -50,7 +49,7 @@ def make(**changes: object) -> Capture:
     return capture_from_arrays(given.pop("camera"), given.pop("objects"), **given)
 
 
-def test_arrays_give_the_same_capture_as_the_folder(tmp_path: Path) -> None:
+def test_arrays_give_the_same_capture_as_the_folder(tmp_path):
     folder = tiny.write_capture(tmp_path / "tiny")
     # What arrays cannot say the same way: where the ground is, and numbers of annotations.
     scene, objects = tiny.scene(), tiny.objects()
@@ -62,29 +61,26 @@ def test_arrays_give_the_same_capture_as_the_folder(tmp_path: Path) -> None:
     close(read_capture(folder), make())
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (
-            {"objects": [chair(mask=tiny.object_mask(0)[1:])]},
-            r"annotations\[0\].segmentation.*size",
-        ),
-        ({"objects": [chair(mask=tiny.object_mask(0) * 1.0)]}, r"objects\[0\].mask.*booleans"),
-        ({"objects": [chair(mask=tiny.object_mask(0) & False)]}, "an empty mask"),
-        ({"objects": [chair(vertices=tiny.STEP * np.nan)]}, r"objects\[0\].vertices' has nan"),
-        ({"objects": [chair(faces=tiny.STEP_FACES + 1)]}, r"objects\[0\].faces.*vertices 1 to 5"),
-        ({"objects": [chair(faces=tiny.STEP_FACES[:0])]}, "an empty mesh"),
-        ({"objects": [chair(yaw=np.inf)]}, r"objects\[0\].yaw' has inf"),
-        ({"objects": [chair(), chair()]}, "used twice"),
-        ({"image": tiny.picture()[:4]}, "'image' has shape"),
-        ({"image": tiny.picture() * 1.0}, "bytes, or numbers from 0 to 1"),
-        ({"camera": tiny.camera(fl_x=0.0)}, "camera.fl_x' has 0.0"),
-        ({"people": PeopleArrays(np.zeros((1, 48, 64)), [0], [0])}, "people.masks.*booleans"),
-        ({"people": PeopleArrays(np.zeros((1, 48, 64), bool), [0, 1], [0])}, "people.frame"),
-        ({"bodies": {**tiny.bodies(), "faces": tiny.BODY_FACES + 9}}, "bodies.faces"),
-    ],
-)
-def test_the_checks_are_those_of_the_folder(change: dict[str, Any], words: str) -> None:
+@pytest.mark.parametrize(("change", "words"), [
+    (
+        {"objects": [chair(mask=tiny.object_mask(0)[1:])]},
+        r"annotations\[0\].segmentation.*size",
+    ),
+    ({"objects": [chair(mask=tiny.object_mask(0) * 1.0)]}, r"objects\[0\].mask.*booleans"),
+    ({"objects": [chair(mask=tiny.object_mask(0) & False)]}, "an empty mask"),
+    ({"objects": [chair(vertices=tiny.STEP * np.nan)]}, r"objects\[0\].vertices' has nan"),
+    ({"objects": [chair(faces=tiny.STEP_FACES + 1)]}, r"objects\[0\].faces.*vertices 1 to 5"),
+    ({"objects": [chair(faces=tiny.STEP_FACES[:0])]}, "an empty mesh"),
+    ({"objects": [chair(yaw=np.inf)]}, r"objects\[0\].yaw' has inf"),
+    ({"objects": [chair(), chair()]}, "used twice"),
+    ({"image": tiny.picture()[:4]}, "'image' has shape"),
+    ({"image": tiny.picture() * 1.0}, "bytes, or numbers from 0 to 1"),
+    ({"camera": tiny.camera(fl_x=0.0)}, "camera.fl_x' has 0.0"),
+    ({"people": PeopleArrays(np.zeros((1, 48, 64)), [0], [0])}, "people.masks.*booleans"),
+    ({"people": PeopleArrays(np.zeros((1, 48, 64), bool), [0, 1], [0])}, "people.frame"),
+    ({"bodies": {**tiny.bodies(), "faces": tiny.BODY_FACES + 9}}, "bodies.faces"),
+])  # fmt: skip
+def test_the_checks_are_those_of_the_folder(change, words):
     with pytest.raises(InputError, match=words) as caught:
         make(**change)
     assert str(caught.value).startswith("arrays: field")

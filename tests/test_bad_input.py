@@ -2,7 +2,6 @@
 
 import json
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ NAN = float("nan")
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     return tiny.write_capture(tmp_path / "tiny")
 
 
@@ -142,9 +141,7 @@ JSON = [
 
 
 @pytest.mark.parametrize(("file", "path", "value", "words"), JSON)
-def test_a_wrong_field_is_named(
-    folder: Path, file: str, path: str, value: object, words: str
-) -> None:
+def test_a_wrong_field_is_named(folder, file, path, value, words):
     tree = json.loads((folder / file).read_text())
     put(tree, path, value)
     (folder / file).write_text(json.dumps(tree))
@@ -191,54 +188,49 @@ ARRAYS = [
 
 
 @pytest.mark.parametrize(("name", "value", "words"), ARRAYS)
-def test_a_wrong_array_is_named(folder: Path, name: str, value: Any, words: str) -> None:
+def test_a_wrong_array_is_named(folder, name, value, words):
     arrays = tiny.bodies()
     put(arrays, name, value)
     np.savez(folder / "bodies.npz", **arrays)
     refused(folder, "bodies.npz", words)
 
 
-@pytest.mark.parametrize(
-    ("value", "words"),
-    [
-        (tiny.touch()[:2], "shape"),
-        (tiny.touch() + 0.5, "expected probabilities"),
-        (tiny.touch() * NAN, "finite"),
-    ],
-)
-def test_chances_of_contact_are_checked(folder: Path, value: np.ndarray, words: str) -> None:
+@pytest.mark.parametrize(("value", "words"), [
+    (tiny.touch()[:2], "shape"),
+    (tiny.touch() + 0.5, "expected probabilities"),
+    (tiny.touch() * NAN, "finite"),
+])  # fmt: skip
+def test_chances_of_contact_are_checked(folder, value, words):
     np.savez(folder / "contacts.npz", probability=value)
     refused(folder, "contacts.npz", words)
 
 
 @pytest.mark.parametrize("name", ["camera.json", "scene.json", "objects.json"])
-def test_a_missing_file_is_named(folder: Path, name: str) -> None:
+def test_a_missing_file_is_named(folder, name):
     (folder / name).unlink()
     refused(folder, name, "no such file")
 
 
 @pytest.mark.parametrize("text", [b"", b"{", b"\xff\xfe\x00", b"[" * 100_000, b"nan"])
 @pytest.mark.parametrize("name", ["camera.json", "scene.json", "objects.json", "people.json"])
-def test_a_file_that_is_not_json_is_named(folder: Path, name: str, text: bytes) -> None:
+def test_a_file_that_is_not_json_is_named(folder, name, text):
     (folder / name).write_bytes(text)
     refused(folder, name, "is not JSON")
 
 
 @pytest.mark.parametrize("name", ["bodies.npz", "contacts.npz"])
-def test_a_file_that_is_not_npz_is_named(folder: Path, name: str) -> None:
+def test_a_file_that_is_not_npz_is_named(folder, name):
     for content in (b"", b"PK\x03\x04 not really", (folder / name).read_bytes()[:200]):
         (folder / name).write_bytes(content)
         refused(folder, name, "cannot be read")
 
 
-def test_pickled_objects_are_refused_unread(folder: Path) -> None:
+def test_pickled_objects_are_refused_unread(folder):
     np.savez(folder / "bodies.npz", frame=np.array([{"a": 1}], dtype=object))
     refused(folder, "bodies.npz", "field 'frame'.*no pickled objects")
 
 
-def test_an_array_that_unpacks_to_more_than_the_limit_is_refused_by_its_header(
-    folder: Path,
-) -> None:
+def test_an_array_that_unpacks_to_more_than_the_limit_is_refused_by_its_header(folder):
     header = {"descr": "<f4", "fortran_order": False, "shape": (100_000, 100_000, 3)}
     path = folder / "bodies.npz"
     with zipfile.ZipFile(path, "w") as archive, archive.open("vertices.npy", "w") as stream:
@@ -249,18 +241,15 @@ def test_an_array_that_unpacks_to_more_than_the_limit_is_refused_by_its_header(
 OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("", "cannot be read|empty mesh"),
-        (OBJ, "cannot be read|empty mesh"),
-        (OBJ + "f 1 1 2\n", "empty mesh"),
-        (OBJ + "f 1 2 7\n", "cannot be read|name vertices"),
-        (OBJ.replace("1 0 0", "nan 0 0") + "f 1 2 3\n", "NaN"),
-        (OBJ.replace("0 1 0", "2 0 0") + "f 1 2 3\n", "a line or a point"),
-    ],
-)
-def test_a_mesh_without_a_surface_is_named(folder: Path, text: str, words: str) -> None:
+@pytest.mark.parametrize(("text", "words"), [
+    ("", "cannot be read|empty mesh"),
+    (OBJ, "cannot be read|empty mesh"),
+    (OBJ + "f 1 1 2\n", "empty mesh"),
+    (OBJ + "f 1 2 7\n", "cannot be read|name vertices"),
+    (OBJ.replace("1 0 0", "nan 0 0") + "f 1 2 3\n", "NaN"),
+    (OBJ.replace("0 1 0", "2 0 0") + "f 1 2 3\n", "a line or a point"),
+])  # fmt: skip
+def test_a_mesh_without_a_surface_is_named(folder, text, words):
     (folder / "meshes" / "step.obj").write_text(text)
     message = refused(folder, "scene.json", words)
     assert "objects[0].mesh" in message
@@ -268,7 +257,7 @@ def test_a_mesh_without_a_surface_is_named(folder: Path, text: str, words: str) 
 
 @pytest.mark.parametrize("kind", ["glb", "gltf", "ply", "off", "stl"])
 @pytest.mark.parametrize("content", [b"", b"solid x\n", bytes(range(256)) * 3])
-def test_a_broken_mesh_file_is_named(folder: Path, kind: str, content: bytes) -> None:
+def test_a_broken_mesh_file_is_named(folder, kind, content):
     (folder / "meshes" / f"broken.{kind}").write_bytes(content)
     scene = tiny.scene()
     put(scene, "objects.0.mesh", f"meshes/broken.{kind}")
@@ -276,17 +265,12 @@ def test_a_broken_mesh_file_is_named(folder: Path, kind: str, content: bytes) ->
     refused(folder, "scene.json", "broken|empty mesh")
 
 
-@pytest.mark.parametrize(
-    ("tree", "words"),
-    [
-        ({"buffers": [{"uri": "../../secret.bin", "byteLength": 4}]}, "buffers beside it"),
-        ({"accessors": [{"count": 1 << 40}]}, "1099511627776"),
-        ({"buffers": [3]}, "cannot be read"),
-    ],
-)
-def test_a_gltf_that_reaches_out_of_its_folder_or_of_memory_is_refused(
-    folder: Path, tree: dict[str, Any], words: str
-) -> None:
+@pytest.mark.parametrize(("tree", "words"), [
+    ({"buffers": [{"uri": "../../secret.bin", "byteLength": 4}]}, "buffers beside it"),
+    ({"accessors": [{"count": 1 << 40}]}, "1099511627776"),
+    ({"buffers": [3]}, "cannot be read"),
+])  # fmt: skip
+def test_a_gltf_that_reaches_out_of_its_folder_or_of_memory_is_refused(folder, tree, words):
     (folder.parent.parent / "secret.bin").write_bytes(b"1234")
     (folder / "meshes" / "a.gltf").write_text(json.dumps(tree))
     scene = tiny.scene()
@@ -295,75 +279,65 @@ def test_a_gltf_that_reaches_out_of_its_folder_or_of_memory_is_refused(
     refused(folder, "scene.json", words)
 
 
-def test_a_link_that_leaves_the_folder_is_refused(folder: Path) -> None:
+def test_a_link_that_leaves_the_folder_is_refused(folder):
     outside = folder.parent / "outside.obj"
     (folder / "meshes" / "step.obj").rename(outside)
     (folder / "meshes" / "step.obj").symlink_to(outside)
     refused(folder, "scene.json", "a link that leaves it")
 
 
-def test_a_picture_of_another_size_is_refused_with_both_sizes(folder: Path) -> None:
+def test_a_picture_of_another_size_is_refused_with_both_sizes(folder):
     from PIL import Image
 
     Image.fromarray(tiny.picture()[:-1]).save(folder / "room.png")
     refused(folder, "objects.json", "'room.png' with 64 x 47 pixels, expected 64 x 48")
 
 
-def test_frames_behind_the_end_of_the_video_are_refused(folder: Path) -> None:
+def test_frames_behind_the_end_of_the_video_are_refused(folder):
     (folder / "frames").mkdir()
     for frame in range(3):
         (folder / "frames" / f"{frame:06d}.jpg").touch()
     refused(folder, "bodies.npz", "'frame' has 3, expected a frame from 0 to 2")
 
 
-@pytest.mark.parametrize(
-    ("file", "path", "value", "words"),
-    [
-        ("objects.json", "annotations.0.bbox", [30, 2, 20, 5], "a box and a mask in different"),
-        ("objects.json", "annotations.0.bbox", [5, 20, 70, 30], "reaches beyond the image"),
-        ("objects.json", "annotations.1.segmentation.0",
-         [40, 10, 80, 10, 80, 30, 40, 30], "leaves the image and was clipped"),
-        ("people.json", "annotations.1.segmentation", None, "1 of 3 people without mask"),
-        ("people.json", "annotations.1.segmentation.counts", [48 * 64], "1 of 3 people without"),
-        ("people.json", "reference_people.0.segmentation", None, "1 people of the reference"),
-        ("scene.json", "ground.height", 0.4, "the ground is not below the camera"),
-        ("scene.json", "objects", [], "there are no objects"),
-        ("scene.json", "objects.0.translation", [0, -1.4, 5], "4.6 m behind the camera"),
-        ("scene.json", "objects.0.translation", [0, -1.4, -45], "is it in metres"),
-        ("scene.json", "objects.0.scale", [1e-8, 0.9, 0.6], "is it flat"),
-        ("camera.json", "fl_x", 6000.0, "fl_x 6000 and fl_y 58.5 differ much"),
-        ("camera.json", "cx", 0, "far from the middle"),
-        ("scene.json", "objects.0.yaw", 90, "yaw' of chair_0 has 90; is it in radians"),
-        ("scene.json", "objects.0.scale", [8.0, 8, 8], "16 m large, as its box"),
-        ("scene.json", "objects.0.category", "sofa", "is a sofa, its annotation 11 a chair"),
-        ("people.json", "info.heights", {"5": 1.7}, "the height of unknown track 5"),
-        ("camera.json", "R_cam_world", [[-1, 0, 0], [0, 1, 0], [0, 0, -1]], "on its side or head"),
-        ("camera.json", "R_cam_world", [[1, 0, 0], [0, 0, 1], [0, -1, 0]], "straight up or down"),
-    ],
-)  # fmt: skip
-def test_what_is_odd_but_not_wrong_is_a_warning(
-    folder: Path, file: str, path: str, value: object, words: str
-) -> None:
+@pytest.mark.parametrize(("file", "path", "value", "words"), [
+    ("objects.json", "annotations.0.bbox", [30, 2, 20, 5], "a box and a mask in different"),
+    ("objects.json", "annotations.0.bbox", [5, 20, 70, 30], "reaches beyond the image"),
+    ("objects.json", "annotations.1.segmentation.0",
+     [40, 10, 80, 10, 80, 30, 40, 30], "leaves the image and was clipped"),
+    ("people.json", "annotations.1.segmentation", None, "1 of 3 people without mask"),
+    ("people.json", "annotations.1.segmentation.counts", [48 * 64], "1 of 3 people without"),
+    ("people.json", "reference_people.0.segmentation", None, "1 people of the reference"),
+    ("scene.json", "ground.height", 0.4, "the ground is not below the camera"),
+    ("scene.json", "objects", [], "there are no objects"),
+    ("scene.json", "objects.0.translation", [0, -1.4, 5], "4.6 m behind the camera"),
+    ("scene.json", "objects.0.translation", [0, -1.4, -45], "is it in metres"),
+    ("scene.json", "objects.0.scale", [1e-8, 0.9, 0.6], "is it flat"),
+    ("camera.json", "fl_x", 6000.0, "fl_x 6000 and fl_y 58.5 differ much"),
+    ("camera.json", "cx", 0, "far from the middle"),
+    ("scene.json", "objects.0.yaw", 90, "yaw' of chair_0 has 90; is it in radians"),
+    ("scene.json", "objects.0.scale", [8.0, 8, 8], "16 m large, as its box"),
+    ("scene.json", "objects.0.category", "sofa", "is a sofa, its annotation 11 a chair"),
+    ("people.json", "info.heights", {"5": 1.7}, "the height of unknown track 5"),
+    ("camera.json", "R_cam_world", [[-1, 0, 0], [0, 1, 0], [0, 0, -1]], "on its side or head"),
+    ("camera.json", "R_cam_world", [[1, 0, 0], [0, 0, 1], [0, -1, 0]], "straight up or down"),
+])  # fmt: skip
+def test_what_is_odd_but_not_wrong_is_a_warning(folder, file, path, value, words):
     tree = json.loads((folder / file).read_text())
     put(tree, path, value)
     (folder / file).write_text(json.dumps(tree))
     assert words in "\n".join(read_capture(folder).warnings)
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (lambda a: {**a, "vertices": a["vertices"] * 1000}, "millimetres.*are they in metres"),
-        (lambda a: {**a, "vertices": a["vertices"] * 100}, "centimetres.*are they in metres"),
-        (lambda a: {**a, "vertices": a["vertices"] / 1000}, "are they in metres"),
-        (lambda a: {**a, "vertices": -a["vertices"]}, "behind the camera"),
-        (lambda a: {**a, "vertices": with_far(a["vertices"])}, "1e.08 m away in row 1"),
-        (lambda a: {**a, "fps": np.array(1e-8)}, "'fps' has 1e-08"),
-    ],
-)
-def test_bodies_that_cannot_be_people_here_are_refused(
-    folder: Path, change: Callable[[dict[str, Any]], dict[str, Any]], words: str
-) -> None:
+@pytest.mark.parametrize(("change", "words"), [
+    (lambda a: {**a, "vertices": a["vertices"] * 1000}, "millimetres.*are they in metres"),
+    (lambda a: {**a, "vertices": a["vertices"] * 100}, "centimetres.*are they in metres"),
+    (lambda a: {**a, "vertices": a["vertices"] / 1000}, "are they in metres"),
+    (lambda a: {**a, "vertices": -a["vertices"]}, "behind the camera"),
+    (lambda a: {**a, "vertices": with_far(a["vertices"])}, "1e.08 m away in row 1"),
+    (lambda a: {**a, "fps": np.array(1e-8)}, "'fps' has 1e-08"),
+])  # fmt: skip
+def test_bodies_that_cannot_be_people_here_are_refused(folder, change, words):
     np.savez(folder / "bodies.npz", **change(tiny.bodies()))
     refused(folder, "bodies.npz", words)
 
@@ -374,22 +348,17 @@ def with_far(verts: np.ndarray) -> np.ndarray:
     return bad
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (lambda a: {**a, "frame": a["frame"] + 9}, "3 of 3 bodies have no mask"),
-        (lambda a: {**a, "person": a["person"] + 5}, "people.json: by its position"),
-        (lambda a: {**a, "joints": a["joints"] + 5}, "'joints' is 8.5 m off the meshes"),
-    ],
-)
-def test_odd_bodies_are_a_warning(
-    folder: Path, change: Callable[[dict[str, Any]], dict[str, Any]], words: str
-) -> None:
+@pytest.mark.parametrize(("change", "words"), [
+    (lambda a: {**a, "frame": a["frame"] + 9}, "3 of 3 bodies have no mask"),
+    (lambda a: {**a, "person": a["person"] + 5}, "people.json: by its position"),
+    (lambda a: {**a, "joints": a["joints"] + 5}, "'joints' is 8.5 m off the meshes"),
+])  # fmt: skip
+def test_odd_bodies_are_a_warning(folder, change, words):
     np.savez(folder / "bodies.npz", **change(tiny.bodies()))
     assert words in "\n".join(read_capture(folder).warnings)
 
 
-def test_two_objects_with_one_mask_are_a_warning(folder: Path) -> None:
+def test_two_objects_with_one_mask_are_a_warning(folder):
     tree = tiny.objects()
     for key in ("segmentation", "bbox"):
         tree["annotations"][1][key] = tree["annotations"][0][key]
@@ -398,20 +367,20 @@ def test_two_objects_with_one_mask_are_a_warning(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["camera.json", "scene.json", "objects.json", "people.json"])
-def test_a_name_that_is_there_twice_is_refused(folder: Path, name: str) -> None:
+def test_a_name_that_is_there_twice_is_refused(folder, name):
     text = (folder / name).read_text()
     (folder / name).write_text('{"info": 1, "info": 2, ' + text[1:])
     refused(folder, name, 'the name "info" is there twice')
 
 
 @pytest.mark.parametrize("name", ["people.json", "bodies.npz", "contacts.npz", "hypotheses.json"])
-def test_a_link_to_nothing_is_no_missing_file(folder: Path, name: str) -> None:
+def test_a_link_to_nothing_is_no_missing_file(folder, name):
     (folder / name).unlink(missing_ok=True)
     (folder / name).symlink_to(folder / "gone")
     refused(folder, name, "no such file")
 
 
-def test_a_wrong_hypothesis_is_named_by_its_object_and_row(folder: Path) -> None:
+def test_a_wrong_hypothesis_is_named_by_its_object_and_row(folder):
     tree = tiny.hypotheses()
     tree["objects"]["chair_0"][1]["yaw"] = NAN
     (folder / "hypotheses.json").write_text(json.dumps(tree))

@@ -122,12 +122,12 @@ WRITERS: dict[str, Callable[[Path], Path]] = {
 }  # fmt: skip
 
 
-def test_every_tool_has_a_fixture() -> None:
+def test_every_tool_has_a_fixture():
     assert set(WRITERS) == set(names("cameras"))
 
 
 @pytest.fixture
-def capture() -> Capture:
+def capture():
     bodies = little_room.walkers(2)
     bodies = dataclasses.replace(bodies, verts=bodies.verts * torch.tensor([1.0, -1, -1]))
     return Capture(
@@ -143,9 +143,7 @@ def points_of(path, frames: list[int]) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("tool", WRITERS)
-def test_the_poses_of_every_tool_come_back_from_a_capture(
-    tool: str, capture: Capture, tmp_path: Path
-) -> None:
+def test_the_poses_of_every_tool_come_back_from_a_capture(tool, capture, tmp_path):
     folder, source = tmp_path / "room", tmp_path / "source"
     write_capture(capture, folder)
     source.mkdir()
@@ -165,14 +163,14 @@ def test_the_poses_of_every_tool_come_back_from_a_capture(
     assert torch.allclose(points_of(again, list(range(COUNT))), expected, atol=1e-5)
 
 
-def test_simple_vo_of_gvhmr_leads_from_world_to_camera(tmp_path: Path) -> None:
+def test_simple_vo_of_gvhmr_leads_from_world_to_camera(tmp_path):
     """zju3dv/GVHMR, hmr4d/utils/preproc/relpose/simple_vo.py: T_w2c, (L, 4, 4)."""
     np.save(tmp_path / "slam_results.npy", np.linalg.inv(true_path()))
     at = read_slam(tmp_path / "slam_results.npy")
     assert np.allclose(at.value["T_world_camera"], true_path())
 
 
-def test_whams_sign_for_no_slam_is_refused(tmp_path: Path) -> None:
+def test_whams_sign_for_no_slam_is_refused(tmp_path):
     row = np.zeros((COUNT, 7))
     row[:, 3] = 1
     joblib.dump(row, tmp_path / "slam_results.pth")
@@ -180,37 +178,32 @@ def test_whams_sign_for_no_slam_is_refused(tmp_path: Path) -> None:
         read_slam(tmp_path)
 
 
-def test_colmaps_binary_poses_are_named_with_their_cure(tmp_path: Path) -> None:
+def test_colmaps_binary_poses_are_named_with_their_cure(tmp_path):
     (tmp_path / "images.bin").write_bytes(bytes(8))
     for path in (tmp_path, tmp_path / "images.bin"):
         with pytest.raises(InputError, match=r"^images\.bin: .*model_converter --output_type TXT"):
             read_colmap(path)
 
 
-@pytest.mark.parametrize(
-    ("file", "line", "words"),
-    [
-        ("t.txt", "0.5 0 0 0 0 0 0 1", "has 0.5, expected numbers of frames"),
-        ("t.txt", "1 0 0 0 0 0 1", "lines of 8 finite numbers"),
-        ("t.txt", "1 0 0 nan 0 0 0 1", "lines of 8 finite numbers"),
-        ("t.txt", "1 0 0 0 0 0 0 x", "another form"),
-        ("t.txt", "1 0 0 0 0 0 0 2", "quaternions of length 1"),
-        ("t.txt", "# nothing", "lines of 8 finite numbers"),
-        ("images.txt", "1 1 0 0 0 0 0 0 1", "IMAGE_ID QW"),
-        ("images.txt", "# nothing", "IMAGE_ID QW"),
-        ("images.txt", "1 1 0 0 0 0 0 0 1 2.jpg\n\n2 1 0 0 0 0 0 0 1 2.png", "each picture once"),
-        ("images.txt", "1 1 0 0 0 0 0 0 1 a2.jpg\n\n2 1 0 0 0 0 0 0 1 2.png", "both frame 2"),
-    ],
-)  # fmt: skip
-def test_wrong_text_is_refused_in_a_sentence(
-    file: str, line: str, words: str, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize(("file", "line", "words"), [
+    ("t.txt", "0.5 0 0 0 0 0 0 1", "has 0.5, expected numbers of frames"),
+    ("t.txt", "1 0 0 0 0 0 1", "lines of 8 finite numbers"),
+    ("t.txt", "1 0 0 nan 0 0 0 1", "lines of 8 finite numbers"),
+    ("t.txt", "1 0 0 0 0 0 0 x", "another form"),
+    ("t.txt", "1 0 0 0 0 0 0 2", "quaternions of length 1"),
+    ("t.txt", "# nothing", "lines of 8 finite numbers"),
+    ("images.txt", "1 1 0 0 0 0 0 0 1", "IMAGE_ID QW"),
+    ("images.txt", "# nothing", "IMAGE_ID QW"),
+    ("images.txt", "1 1 0 0 0 0 0 0 1 2.jpg\n\n2 1 0 0 0 0 0 0 1 2.png", "each picture once"),
+    ("images.txt", "1 1 0 0 0 0 0 0 1 a2.jpg\n\n2 1 0 0 0 0 0 0 1 2.png", "both frame 2"),
+])  # fmt: skip
+def test_wrong_text_is_refused_in_a_sentence(file, line, words, tmp_path):
     (tmp_path / file).write_text(line + "\n")
     with pytest.raises(InputError, match=words):
         (read_colmap if file == "images.txt" else read_tum)(tmp_path)
 
 
-def test_a_pose_between_two_is_half_way(capture: Capture) -> None:
+def test_a_pose_between_two_is_half_way(capture):
     at = {"frame": np.arange(COUNT) * 10, "T_world_camera": true_path()}
     path = path_of(At(at, "cameras.npz"), capture.scene.camera, None, list[str]().append)
     ends = poses_at(path, torch.tensor([0, 10, 20]))
@@ -222,7 +215,7 @@ def test_a_pose_between_two_is_half_way(capture: Capture) -> None:
     assert torch.allclose(step, R[0].mT @ middle.R_reference_camera[0], atol=1e-6)
 
 
-def test_points_go_there_and_back_and_a_larger_scale_moves_the_camera_alone() -> None:
+def test_points_go_there_and_back_and_a_larger_scale_moves_the_camera_alone():
     at = {"frame": np.arange(COUNT), "T_world_camera": true_path()}
     path = path_of(At(at, "cameras.npz"), little_room.camera(), None, list[str]().append)
     poses = poses_at(path, torch.arange(COUNT))
@@ -233,7 +226,7 @@ def test_points_go_there_and_back_and_a_larger_scale_moves_the_camera_alone() ->
     assert torch.allclose(moved, poses.t_reference_camera[:, None].expand(-1, 5, -1), atol=1e-5)
 
 
-def test_a_camera_that_never_moves_is_the_still_one(capture: Capture) -> None:
+def test_a_camera_that_never_moves_is_the_still_one(capture):
     at = {"frame": np.arange(COUNT), "T_world_camera": np.tile(true_path()[:1], (COUNT, 1, 1))}
     path = path_of(At(at, "cameras.npz"), capture.scene.camera, capture.bodies, list[str]().append)
     assert path is STILL
@@ -242,7 +235,7 @@ def test_a_camera_that_never_moves_is_the_still_one(capture: Capture) -> None:
     assert torch.equal(to_reference(points, poses_at(path, torch.arange(3))), points)
 
 
-def test_wrong_cameras_are_refused_in_a_sentence(capture: Capture) -> None:
+def test_wrong_cameras_are_refused_in_a_sentence(capture):
     T, good = true_path(), np.arange(COUNT)
     zoom = np.linspace(0.6, 0.8, COUNT)
     mirrored = T @ np.diag([-1.0, 1, 1, 1])
@@ -263,7 +256,7 @@ def test_wrong_cameras_are_refused_in_a_sentence(capture: Capture) -> None:
             )
 
 
-def test_people_of_a_moving_camera_must_be_in_its_axes(capture: Capture, tmp_path: Path) -> None:
+def test_people_of_a_moving_camera_must_be_in_its_axes(capture, tmp_path):
     assert capture.bodies is not None
     world = dataclasses.replace(capture.bodies, space="world")
     write_capture(dataclasses.replace(capture, bodies=world), tmp_path / "room")
@@ -272,7 +265,7 @@ def test_people_of_a_moving_camera_must_be_in_its_axes(capture: Capture, tmp_pat
         import_into(tmp_path / "room", Parts("cameras", cameras=at))
 
 
-def test_another_lens_is_said(capture: Capture) -> None:
+def test_another_lens_is_said(capture):
     said: list[str] = []
     at = {"frame": np.arange(COUNT), "T_world_camera": true_path(), "focal": np.full(COUNT, 0.9)}
     path_of(At(at, "cameras.npz"), capture.scene.camera, None, said.append)
@@ -337,7 +330,7 @@ def written(folder: Path, name: str, content: str | bytes | dict[str, Any]) -> P
 
 
 @pytest.mark.parametrize("kind", LENSES)
-def test_every_calibration_gives_the_same_lens(kind: str, tmp_path: Path) -> None:
+def test_every_calibration_gives_the_same_lens(kind, tmp_path):
     """Those that count pixels from the centre of the first one are moved by half of one."""
     path = written(tmp_path, *LENSES[kind])
     found = read_camera_file(path, None).value
@@ -366,7 +359,7 @@ NO_LENSES: dict[str, tuple[str, str | bytes | dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("kind", NO_LENSES)
-def test_what_is_no_lens_is_named_in_the_users_words(kind: str, tmp_path: Path) -> None:
+def test_what_is_no_lens_is_named_in_the_users_words(kind, tmp_path):
     name, content, words = NO_LENSES[kind]
     with pytest.raises(InputError, match=words) as caught:
         read_camera_file(written(tmp_path, name, content), None)

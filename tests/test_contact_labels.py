@@ -70,7 +70,7 @@ def test_soles_stand_on_the_floor_and_nothing_else_touches_it():
 
 
 @pytest.mark.parametrize("gap", [0.005, -0.03])
-def test_a_hand_over_a_box_touches_its_top(gap: float):
+def test_a_hand_over_a_box_touches_its_top(gap):
     bodies = standing()
     shelf = shelf_beside(bodies, "left", gap)
     labels = labelled(bodies, shelf)
@@ -113,7 +113,7 @@ def out_with_labels(tmp_path: Path) -> tuple[Path, ContactLabels]:
     return out, labels
 
 
-def test_labels_come_back_from_their_file(tmp_path: Path):
+def test_labels_come_back_from_their_file(tmp_path):
     out, labels = out_with_labels(tmp_path)
     again = read_labels(out / "contacts.npz")
     for field in dataclasses.fields(ContactLabels):
@@ -123,7 +123,7 @@ def test_labels_come_back_from_their_file(tmp_path: Path):
 
 
 @pytest.mark.parametrize("up", ["y", "z"])
-def test_tables_hold_each_label_at_its_frame_part_and_object(tmp_path: Path, up: str):
+def test_tables_hold_each_label_at_its_frame_part_and_object(tmp_path, up):
     out, labels = out_with_labels(tmp_path)
     (file,) = export_contacts(read_finished(out), tmp_path, up).files
     data = np.load(file)
@@ -148,13 +148,13 @@ def test_tables_hold_each_label_at_its_frame_part_and_object(tmp_path: Path, up:
     assert np.array_equal(data["object_contact"], (data["contact"] >= 0.5).any(1))
 
 
-def test_a_result_without_labels_says_what_writes_them(tmp_path: Path, capsys):
+def test_a_result_without_labels_says_what_writes_them(tmp_path, capsys):
     out = write_out(tmp_path / "out", furnished(("table",)), standing(2))
     assert run_command("export", [str(out), "--to", "contacts"]) == 2
     assert "`mover run` writes it" in capsys.readouterr().err
 
 
-def test_a_wrong_file_is_refused(tmp_path: Path):
+def test_a_wrong_file_is_refused(tmp_path):
     out, _ = out_with_labels(tmp_path)
     with np.load(out / "contacts.npz") as data:
         arrays = dict(data)

@@ -20,7 +20,6 @@ from mover.io.files.meshes import write_mesh
 from mover.io.formats import names
 from mover.pipeline.refine import finished_room
 from mover.pipeline.result import to_world
-from mover_bench.rooms.known import KnownRoom
 
 pytestmark = pytest.mark.slow
 TEXTURED = "chair_0"
@@ -29,7 +28,7 @@ PICTURE = np.arange(3 * 64, dtype=np.uint8).reshape(8, 8, 3)
 
 
 @pytest.fixture(scope="module")
-def out(demo_room: KnownRoom, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def out(demo_room, tmp_path_factory):
     """The true room as a result, one of its meshes with a texture, with all of its exports."""
     folder = tmp_path_factory.mktemp("demo")
     bodies = rows_of(demo_room.bodies, demo_room.bodies.frame < FRAMES)
@@ -138,5 +137,5 @@ OPENS: dict[str, Callable[[Path], None]] = {
 
 
 @pytest.mark.parametrize("target", names("export"))
-def test_every_export_of_the_demo_opens(out: Path, target: str):
+def test_every_export_of_the_demo_opens(out, target):
     OPENS[target](out)

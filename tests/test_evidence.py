@@ -60,7 +60,7 @@ def room(hide: bool) -> Capture:
 
 
 @pytest.mark.parametrize("hide", [False, True])
-def test_a_person_before_an_object_is_near_evidence_and_a_hidden_one_far(hide: bool) -> None:
+def test_a_person_before_an_object_is_near_evidence_and_a_hidden_one_far(hide):
     capture = room(hide)
     cupboard, lamp, box, guess = gather_evidence(capture)
     half = disc(0.0)[:, 80:].sum()
@@ -76,7 +76,7 @@ def test_a_person_before_an_object_is_near_evidence_and_a_hidden_one_far(hide: b
     assert guess.missing == ("no annotation",)
 
 
-def test_the_table_shows_every_object_and_every_warning() -> None:
+def test_the_table_shows_every_object_and_every_warning():
     capture = room(hide=False)
     lines = evidence_table(capture, gather_evidence(capture)).splitlines()
     assert " ".join(lines[0].split()) == (
@@ -88,7 +88,7 @@ def test_the_table_shows_every_object_and_every_warning() -> None:
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the shared data is not here")
-def test_the_dancer_of_the_photograph_is_beside_the_bench() -> None:
+def test_the_dancer_of_the_photograph_is_beside_the_bench():
     capture = read_capture(DATA / "photo_bench")
     (bench,) = gather_evidence(capture)
     assert bench.mask_pixels == 41688

@@ -51,7 +51,7 @@ def textured() -> trimesh.Trimesh:
     return shape
 
 
-def test_objects_are_nodes_of_their_ids_where_they_stand(tmp_path: Path):
+def test_objects_are_nodes_of_their_ids_where_they_stand(tmp_path):
     scene = room()
     path = write_glb(scene, None, tmp_path / "scene.glb")
     for given in scene.objects:
@@ -61,7 +61,7 @@ def test_objects_are_nodes_of_their_ids_where_they_stand(tmp_path: Path):
         )
 
 
-def test_a_node_holds_the_placement_and_its_mesh_keeps_its_own_frame(tmp_path: Path):
+def test_a_node_holds_the_placement_and_its_mesh_keeps_its_own_frame(tmp_path):
     turned = dataclasses.replace(room().objects[0], scale=torch.tensor([1.2, 0.8, 1.0]))
     path = write_glb(Scene(camera(), None, (turned,)), None, tmp_path / "scene.glb")
     node = next(n for n in tree_of(path)["nodes"] if n.get("name") == "chair_0")
@@ -73,7 +73,7 @@ def test_a_node_holds_the_placement_and_its_mesh_keeps_its_own_frame(tmp_path: P
     assert matrix[:3, :3] @ corner + matrix[:3, 3] == pytest.approx(by_hand, abs=1e-6)
 
 
-def test_textures_of_the_users_file_survive(tmp_path: Path):
+def test_textures_of_the_users_file_survive(tmp_path):
     file = tmp_path / "chair.glb"
     textured().export(file)
     scene = Scene(camera(), None, (with_file(file),))
@@ -82,7 +82,7 @@ def test_textures_of_the_users_file_survive(tmp_path: Path):
     assert np.array_equal(np.asarray(image.convert("RGB")).ravel(), np.arange(48))
 
 
-def test_transforms_inside_the_users_file_apply(tmp_path: Path):
+def test_transforms_inside_the_users_file_apply(tmp_path):
     inside = trimesh.Scene()
     lift = trimesh.transformations.translation_matrix([0.0, 0.45, 0.0])
     inside.add_geometry(trimesh.creation.box(extents=(0.5, 0.9, 0.5)), transform=lift)
@@ -97,7 +97,7 @@ def test_transforms_inside_the_users_file_apply(tmp_path: Path):
     assert found.volume == pytest.approx(1.2 * 0.8 * (0.5 * 0.9 * 0.5 + 0.1 * 0.2 * 0.1), rel=1e-4)
 
 
-def test_at_most_twelve_bodies_are_named_after_person_and_frame(tmp_path: Path):
+def test_at_most_twelve_bodies_are_named_after_person_and_frame(tmp_path):
     bodies = walkers(40, people=2)
     path = write_glb(room(), bodies, tmp_path / "scene.glb")
     names = [n["name"] for n in tree_of(path)["nodes"] if n.get("name", "").startswith("body_")]
@@ -111,7 +111,7 @@ def test_at_most_twelve_bodies_are_named_after_person_and_frame(tmp_path: Path):
         )
 
 
-def test_the_floor_is_level_under_everything_and_faces_up(tmp_path: Path):
+def test_the_floor_is_level_under_everything_and_faces_up(tmp_path):
     scene = room()
     floor = placed(write_glb(scene, None, tmp_path / "scene.glb"), "ground")
     assert floor.bounds[:, 1] == pytest.approx([scene.ground, scene.ground])
@@ -121,7 +121,7 @@ def test_the_floor_is_level_under_everything_and_faces_up(tmp_path: Path):
     assert (floor.bounds[1, [0, 2]] > stands.max(0)[[0, 2]]).all()
 
 
-def test_the_camera_sees_the_same_pixels(tmp_path: Path):
+def test_the_camera_sees_the_same_pixels(tmp_path):
     scene = dataclasses.replace(room(), camera=camera(-0.3, 0.1))
     tree = tree_of(write_glb(scene, None, tmp_path / "scene.glb"))
     lens = tree["cameras"][0]["perspective"]
@@ -136,7 +136,7 @@ def test_the_camera_sees_the_same_pixels(tmp_path: Path):
     assert [u, v] == pytest.approx(seen[:2] / seen[2], abs=0.01)
 
 
-def test_names_that_clash_stay_apart(tmp_path: Path):
+def test_names_that_clash_stay_apart(tmp_path):
     names = ("ground", "camera", "world", "body_0_0", "ground_mesh")
     pieces = [piece(n, box(1, 1, 1), (i * 2.0, -3.0), 0.0, -1.5) for i, n in enumerate(names)]
     path = write_glb(Scene(camera(), -1.5, tuple(pieces)), walkers(1), tmp_path / "scene.glb")
@@ -145,7 +145,7 @@ def test_names_that_clash_stay_apart(tmp_path: Path):
     assert len({n["name"] for n in tree["nodes"]}) == len(tree["nodes"])
 
 
-def test_normals_of_flattened_triangles_are_valid(tmp_path: Path):
+def test_normals_of_flattened_triangles_are_valid(tmp_path):
     shape = trimesh.Trimesh(
         [[0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0], [3, 0, 0], [4, 0, 0.0]],
         [[0, 1, 2], [3, 4, 5]],
@@ -163,6 +163,6 @@ def test_normals_of_flattened_triangles_are_valid(tmp_path: Path):
     assert np.linalg.norm(normals, axis=1) == pytest.approx(np.ones(6), abs=1e-3)
 
 
-def test_the_file_appears_all_at_once(tmp_path: Path):
+def test_the_file_appears_all_at_once(tmp_path):
     write_glb(Scene(camera(), None, ()), None, tmp_path / "out" / "scene.glb")
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["scene.glb"]

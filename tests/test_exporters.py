@@ -11,14 +11,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from furnished import (
-    bodies_of,
-    furnished,
-    moving_pose,
-    similar,
-    two_people,
-    write_out,
-)
+from furnished import bodies_of, furnished, moving_pose, similar, two_people, write_out
 from little_room import walkers
 
 import mover.io.export.solids
@@ -147,7 +140,7 @@ def rows(bodies: Bodies, person: int) -> list[tuple[int, float]]:
 
 
 @pytest.mark.parametrize("person", [0, 1])
-def test_bones_carry_the_skin_to_the_result_in_every_frame(tmp_path: Path, person: int):
+def test_bones_carry_the_skin_to_the_result_in_every_frame(tmp_path, person):
     bodies = two_people()
     found = export_glb(finished(tmp_path, bodies), tmp_path)
     glb = Glb(found.files[0])
@@ -161,7 +154,7 @@ def test_bones_carry_the_skin_to_the_result_in_every_frame(tmp_path: Path, perso
     assert f"{1e3 * worst:.0f} mm" in " ".join(found.notes) or person == 1
 
 
-def test_a_person_is_hidden_while_they_are_not_seen(tmp_path: Path):
+def test_a_person_is_hidden_while_they_are_not_seen(tmp_path):
     bodies = two_people()
     glb = Glb(export_glb(finished(tmp_path, bodies), tmp_path).files[0])
     seen = [t for _, t in rows(bodies, 1)]
@@ -172,7 +165,7 @@ def test_a_person_is_hidden_while_they_are_not_seen(tmp_path: Path):
     assert glb.matrix(glb.named("person_0"), 0.0)[0, 0] == 1.0
 
 
-def test_shapes_are_the_result_at_the_keys_and_near_it_between(tmp_path: Path):
+def test_shapes_are_the_result_at_the_keys_and_near_it_between(tmp_path):
     bodies = bodies_of(moving_pose(30, pace=0.1))
     glb = Glb(export_glb(finished(tmp_path, bodies), tmp_path, "morph").files[0])
     miss = np.array([
@@ -185,7 +178,7 @@ def test_shapes_are_the_result_at_the_keys_and_near_it_between(tmp_path: Path):
     assert keys < 30
 
 
-def test_bodies_without_parameters_still_move(tmp_path: Path):
+def test_bodies_without_parameters_still_move(tmp_path):
     bodies = walkers(20, people=2)
     found = export_glb(finished(tmp_path, bodies), tmp_path)
     glb = Glb(found.files[0])
@@ -194,12 +187,12 @@ def test_bodies_without_parameters_still_move(tmp_path: Path):
     assert "--capture" in " ".join(found.notes)
 
 
-def test_bones_that_are_asked_for_and_not_there_are_refused(tmp_path: Path):
+def test_bones_that_are_asked_for_and_not_there_are_refused(tmp_path):
     with pytest.raises(InputError, match="--body skin"):
         export_glb(finished(tmp_path, walkers(2)), tmp_path, "skin")
 
 
-def test_parameters_of_the_capture_move_bodies_that_were_turned_and_sized(tmp_path: Path):
+def test_parameters_of_the_capture_move_bodies_that_were_turned_and_sized(tmp_path):
     truth = two_people()
     scene = scaled(furnished())
     grown, turn = similar(truth, 1.03)
@@ -215,7 +208,7 @@ def test_parameters_of_the_capture_move_bodies_that_were_turned_and_sized(tmp_pa
     assert turn.shape == (3, 3)
 
 
-def test_trimesh_opens_the_file_with_the_objects_in_place(tmp_path: Path):
+def test_trimesh_opens_the_file_with_the_objects_in_place(tmp_path):
     home = finished(tmp_path, two_people(4))
     scene = trimesh.load_scene(export_glb(home, tmp_path).files[0])
     for piece in home.scene.objects:
@@ -226,7 +219,7 @@ def test_trimesh_opens_the_file_with_the_objects_in_place(tmp_path: Path):
 
 
 @pytest.mark.parametrize("people", [False, True])
-def test_an_object_that_is_moved_jumps_to_its_next_place(tmp_path: Path, people: bool):
+def test_an_object_that_is_moved_jumps_to_its_next_place(tmp_path, people):
     home = finished(tmp_path, two_people(4) if people else None)
     piece, *others = home.scene.objects
     later = Segment(8, piece.t_world_object + torch.tensor([0.0, 0.0, 1.0]), piece.yaw + 1)
@@ -267,12 +260,12 @@ def test_no_frame_between_keys_is_farther_off_than_is_said_and_few_keys_are_few(
 
 
 @pytest.fixture(autouse=True)
-def along_the_axes(monkeypatch: pytest.MonkeyPatch) -> None:
+def along_the_axes(monkeypatch):
     """CoACD takes seconds for parts that no test looks at."""
     monkeypatch.setattr(mover.io.export.solids, "find_spec", lambda _: None)
 
 
-def test_usd_keeps_textures_and_names_that_it_does_not_allow(tmp_path: Path):
+def test_usd_keeps_textures_and_names_that_it_does_not_allow(tmp_path):
     Usd = pytest.importorskip("pxr.Usd", reason="needs usd-core")
     from PIL import Image
 
@@ -305,7 +298,7 @@ def test_usd_keeps_textures_and_names_that_it_does_not_allow(tmp_path: Path):
 
 
 @pytest.mark.parametrize("up", ["y", "z"])
-def test_the_parameters_give_the_bodies_back(tmp_path: Path, up: str):
+def test_the_parameters_give_the_bodies_back(tmp_path, up):
     bodies = two_people()
     found = export_amass(finished(tmp_path, bodies), tmp_path, up)
     for person, file in enumerate(found.files):
@@ -328,13 +321,13 @@ def test_the_parameters_give_the_bodies_back(tmp_path: Path, up: str):
         assert arrays["mocap_framerate"] == 5.0  # every second frame of 10 a second
 
 
-def test_bodies_without_parameters_are_refused_with_the_way_out(tmp_path: Path):
+def test_bodies_without_parameters_are_refused_with_the_way_out(tmp_path):
     home = finished(tmp_path, walkers(3))
     with pytest.raises(InputError, match="--capture"):
         export_amass(home, tmp_path)
 
 
-def test_single_objects_stand_in_the_world(tmp_path: Path):
+def test_single_objects_stand_in_the_world(tmp_path):
     home = finished(tmp_path)
     files = export_ply(home, tmp_path).files
     for piece, file in zip(home.scene.objects, files, strict=True):
@@ -345,7 +338,7 @@ def test_single_objects_stand_in_the_world(tmp_path: Path):
         assert found.area == pytest.approx(truth.area, rel=1e-4)
 
 
-def test_the_command_writes_what_is_asked_for(tmp_path: Path, capsys):
+def test_the_command_writes_what_is_asked_for(tmp_path, capsys):
     out = write_out(tmp_path / "out", furnished(("chair",)), bodies_of(moving_pose(3)))
     assert run_command("export", [str(out), "--to", "glb", "ply", "amass"]) == 0
     names = {p.name for p in (out / "export").rglob("*") if p.is_file()}
@@ -353,13 +346,13 @@ def test_the_command_writes_what_is_asked_for(tmp_path: Path, capsys):
     assert "on bones" in capsys.readouterr().out
 
 
-def test_without_usd_core_the_way_to_get_it_is_said(tmp_path: Path, monkeypatch):
+def test_without_usd_core_the_way_to_get_it_is_said(tmp_path, monkeypatch):
     monkeypatch.setattr(mover.io.export.usd, "find_spec", lambda _: None)
     with pytest.raises(InputError, match=r"\.\[usd\]"):
         export_usd(finished(tmp_path), tmp_path)
 
 
-def test_a_second_export_gives_the_same_bytes(tmp_path: Path):
+def test_a_second_export_gives_the_same_bytes(tmp_path):
     home = finished(tmp_path, two_people(5))
     for name in ("glb", "ply", "amass"):
         one = chosen("--to", name, "export")(home, tmp_path / "a").files
@@ -367,7 +360,7 @@ def test_a_second_export_gives_the_same_bytes(tmp_path: Path):
         assert [f.read_bytes() for f in one] == [f.read_bytes() for f in two]
 
 
-def test_angles_turn_back(tmp_path: Path):
+def test_angles_turn_back(tmp_path):
     """Quaternions of neighbouring frames are on one side, so that viewers turn the short way."""
     pose = moving_pose(40)
     spin = torch.linspace(0, 4 * math.pi, 40)

@@ -21,7 +21,7 @@ DATA = Path(__file__).parents[2] / "shared" / "data"
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     return tiny.write_capture(tmp_path / "tiny")
 
 
@@ -48,7 +48,7 @@ def close(a: object, b: object) -> None:
         assert a == b
 
 
-def test_every_field_of_a_capture_arrives(folder: Path) -> None:
+def test_every_field_of_a_capture_arrives(folder):
     found = read("folder", folder)
     assert found.name == "tiny"
     assert found.camera_height == 1.45
@@ -72,7 +72,7 @@ def test_every_field_of_a_capture_arrives(folder: Path) -> None:
     assert found.warnings == ()
 
 
-def test_meshes_come_with_the_transforms_of_their_nodes(folder: Path) -> None:
+def test_meshes_come_with_the_transforms_of_their_nodes(folder):
     chair, lamp = read_capture(folder).scene.objects
     step = torch.from_numpy(tiny.STEP).float()
     assert torch.allclose(chair.mesh.verts, step)
@@ -81,14 +81,13 @@ def test_meshes_come_with_the_transforms_of_their_nodes(folder: Path) -> None:
     assert Path(lamp.mesh_file).read_bytes() == (folder / "meshes" / "lamp.glb").read_bytes()
 
 
-def test_evidence_arrives_as_it_was_drawn(folder: Path) -> None:
+def test_evidence_arrives_as_it_was_drawn(folder):
     found = read_capture(folder)
     for detection, index in zip(found.detections, (0, 1), strict=True):
         assert detection.mask is not None
         assert (decode(detection.mask, 0).numpy() == tiny.object_mask(index)).all()
     assert found.detections[0].score == 0.75
     assert found.detections[1].box.tolist() == [40.5, 10, 59.75, 30]
-    assert found.people is not None
     assert found.reference_people is not None
     for row in range(3):
         assert (decode(found.people.masks, row).numpy() == tiny.person_mask(row)).all()
@@ -98,23 +97,20 @@ def test_evidence_arrives_as_it_was_drawn(folder: Path) -> None:
     assert found.people.heights == {"0": 1.78}
     assert found.reference is not None
     assert ((found.reference * 255).round().numpy() == tiny.picture()).all()
-    assert found.touch is not None
     assert (found.touch.numpy() == tiny.touch()).all()
 
 
-def test_bodies_take_the_frame_rate_of_people_json(folder: Path) -> None:
+def test_bodies_take_the_frame_rate_of_people_json(folder):
     found = read_capture(folder).bodies
-    assert found is not None
     assert found.fps == 5.0
     assert (found.verts.numpy() == tiny.bodies()["vertices"]).all()
     assert found.joint_names == ("head", "foot")
     np.savez(folder / "bodies.npz", **tiny.bodies(), fps=30.0)
     found = read_capture(folder).bodies
-    assert found is not None
     assert found.fps == 30
 
 
-def test_writing_and_reading_gives_the_same_capture(folder: Path, tmp_path: Path) -> None:
+def test_writing_and_reading_gives_the_same_capture(folder, tmp_path):
     first = read_capture(folder)
     write_capture(first, tmp_path / "copy")
     second = read_capture(tmp_path / "copy")
@@ -128,7 +124,7 @@ def test_writing_and_reading_gives_the_same_capture(folder: Path, tmp_path: Path
         assert path.read_bytes() == same.read_bytes(), path.name
 
 
-def test_a_capture_without_anything_optional_is_read_with_a_word_about_each(folder: Path) -> None:
+def test_a_capture_without_anything_optional_is_read_with_a_word_about_each(folder):
     for name in ("bodies.npz", "people.json", "contacts.npz"):
         (folder / name).unlink()
     (folder / "camera.json").write_text(
@@ -151,7 +147,7 @@ def test_a_capture_without_anything_optional_is_read_with_a_word_about_each(fold
         assert word.strip("'") in told, (word, told)
 
 
-def test_what_scene_json_says_about_the_camera_wins(folder: Path) -> None:
+def test_what_scene_json_says_about_the_camera_wins(folder):
     other = tiny.camera(fl_x=70.0)
     del other["R_cam_world"]
     edit(folder / "scene.json", camera=other)
@@ -160,7 +156,7 @@ def test_what_scene_json_says_about_the_camera_wins(folder: Path) -> None:
     assert float(pitch_roll(camera.R_cam_world)[0]) == pytest.approx(tiny.PITCH, abs=1e-6)
 
 
-def test_a_heading_turns_the_world_and_leaves_the_view(folder: Path) -> None:
+def test_a_heading_turns_the_world_and_leaves_the_view(folder):
     straight = read_capture(folder)
     # The same room in a world that is turned by -heading: same camera picture.
     heading, scene = 0.7, tiny.scene()
@@ -179,7 +175,6 @@ def test_a_heading_turns_the_world_and_leaves_the_view(folder: Path) -> None:
     np.savez(folder / "bodies.npz", **bodies)
     found = read_capture(folder)
     assert float(found.scene.camera.R_cam_world[2, 0]) == pytest.approx(0, abs=1e-6)
-    assert found.bodies is not None
     assert found.bodies.space == "camera"
     wrapped = dataclasses.replace(
         straight,
@@ -194,24 +189,24 @@ def test_a_heading_turns_the_world_and_leaves_the_view(folder: Path) -> None:
     close(wrapped, found)
 
 
-def test_a_capture_is_not_mixed_with_what_lies_in_its_folder(folder: Path) -> None:
+def test_a_capture_is_not_mixed_with_what_lies_in_its_folder(folder):
     capture = dataclasses.replace(read_capture(folder), people=None, reference_people=None)
     with pytest.raises(ValueError, match=r"has people.json, which the capture lacks"):
         write_capture(capture, folder)
 
 
-def test_truth_is_not_looked_at(folder: Path) -> None:
+def test_truth_is_not_looked_at(folder):
     (folder / "truth").mkdir()
     (folder / "truth" / "scene.json").write_text("broken")
     assert read_capture(folder).warnings == ()
 
 
-def test_an_unknown_format_names_the_choices() -> None:
+def test_an_unknown_format_names_the_choices():
     with pytest.raises(ValueError, match=", ".join(sorted(names("capture")))):
         read("prose", Path())
 
 
-def test_every_row_of_the_table_of_formats_has_a_function_and_a_name_of_its_own() -> None:
+def test_every_row_of_the_table_of_formats_has_a_function_and_a_name_of_its_own():
     homes = [
         *((kind,) for kind in ("capture", "people", "cameras", "keypoints", "export")),
         IMPORTED,
@@ -225,7 +220,7 @@ def test_every_row_of_the_table_of_formats_has_a_function_and_a_name_of_its_own(
         chosen("--to", "dwg", "export")
 
 
-def test_the_table_of_formats_is_listed_without_anything_heavy() -> None:
+def test_the_table_of_formats_is_listed_without_anything_heavy():
     code = (
         "import sys; from mover.io.formats import FORMATS, listing; assert listing('scene');"
         "assert not {'torch', 'numpy', 'trimesh'} & set(sys.modules)"
@@ -234,23 +229,20 @@ def test_the_table_of_formats_is_listed_without_anything_heavy() -> None:
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the shared data is not here")
-def test_a_real_photograph_is_read_without_a_word() -> None:
+def test_a_real_photograph_is_read_without_a_word():
     found = read_capture(DATA / "photo_bench")
     assert found.warnings == ()
-    assert found.bodies is not None
     assert tuple(found.bodies.verts.shape) == (1, 18439, 3)
     assert found.people is not None
-    assert found.reference is not None
     assert tuple(found.reference.shape) == (898, 1600, 3)
     mask = found.detections[0].mask
     assert mask is not None
     assert int(decode(mask, 0).sum()) == 41688  # COCO's own "area" in the file
 
 
-def test_a_capture_in_double_precision_is_written_too(folder: Path, tmp_path: Path) -> None:
+def test_a_capture_in_double_precision_is_written_too(folder, tmp_path):
     double = map_tensors(lambda x: x.double() if x.is_floating_point() else x, read_capture(folder))
     write_capture(double, tmp_path / "double")
     found = read_capture(tmp_path / "double")
     assert isinstance(found, Capture)
-    assert found.bodies is not None
     assert found.bodies.verts.dtype == torch.float32

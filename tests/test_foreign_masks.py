@@ -130,9 +130,7 @@ VIDEOS = {  # how a walker is written, and his track
 
 
 @pytest.mark.parametrize("way", VIDEOS)
-def test_frames_keep_their_numbers_over_gaps_and_a_person_is_one_track(
-    way: str, tmp_path: Path
-) -> None:
+def test_frames_keep_their_numbers_over_gaps_and_a_person_is_one_track(way, tmp_path):
     write, track = VIDEOS[way]
     got = pixels(read_people(write(tmp_path / "in"), {}, None))
     assert list(got) == [(frame, track) for frame in KEPT]
@@ -141,28 +139,23 @@ def test_frames_keep_their_numbers_over_gaps_and_a_person_is_one_track(
         assert off <= (0.15 if "soft" in way or "jpg" in way else 0)
 
 
-@pytest.mark.parametrize(
-    ("way", "said"),
-    [
-        ("frame_0001.png", "numbers 1 to 8 with 3 left out count from 1: 1 is frame 0"),
-        ("results from 1", "image_ids 1 to 8 with 3 left out count from 1"),
-        ("frame_0001.png", "white masks are one person"),
-        ("results from 0", "people without tracks: 1, one in each frame"),
-    ],
-)
-def test_what_is_decided_of_frames_and_tracks_is_said(way: str, said: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("way", "said"), [
+    ("frame_0001.png", "numbers 1 to 8 with 3 left out count from 1: 1 is frame 0"),
+    ("results from 1", "image_ids 1 to 8 with 3 left out count from 1"),
+    ("frame_0001.png", "white masks are one person"),
+    ("results from 0", "people without tracks: 1, one in each frame"),
+])  # fmt: skip
+def test_what_is_decided_of_frames_and_tracks_is_said(way, said, tmp_path):
     notes = read_people(VIDEOS[way][0](tmp_path / "in"), {}, None).notes
     assert any(said in note for note in notes), notes
 
 
-def test_frames_without_people_are_frames_that_were_looked_at(tmp_path: Path) -> None:
+def test_frames_without_people_are_frames_that_were_looked_at(tmp_path):
     assert read_people(coco("", 1)(tmp_path / "in"), {}, None).frames == set(range(8))
 
 
 @pytest.mark.parametrize("boxes", [True, False])
-def test_people_without_tracks_are_followed_by_place_not_by_score(
-    boxes: bool, tmp_path: Path
-) -> None:
+def test_people_without_tracks_are_followed_by_place_not_by_score(boxes, tmp_path):
     """The one with the better score alternates, and so does their order (k34)."""
     rows: list[dict[str, Any]] = []
     for k in range(12):
@@ -178,7 +171,7 @@ def test_people_without_tracks_are_followed_by_place_not_by_score(
         assert (got[k, 1] == walker(k, 24)).all()
 
 
-def test_a_stack_of_frames_is_a_person_and_one_of_apart_masks_are_people(tmp_path: Path) -> None:
+def test_a_stack_of_frames_is_a_person_and_one_of_apart_masks_are_people(tmp_path):
     np.save(tmp_path / "logits.npy", walker(0) * 2.5 - 1.2)
     (lone,) = pixels(read_people(tmp_path / "logits.npy", {}, None)).values()
     assert (lone == walker(0)).all()
@@ -193,7 +186,7 @@ def test_a_stack_of_frames_is_a_person_and_one_of_apart_masks_are_people(tmp_pat
     assert any("3 masks are people of one image" in note for note in found.notes)
 
 
-def test_soft_labels_are_labels_and_a_dancer_is_a_person(tmp_path: Path) -> None:
+def test_soft_labels_are_labels_and_a_dancer_is_a_person(tmp_path):
     both = walker(0) * 85 + walker(0, 40) * 170
     folder = tmp_path / "in"
     folder.mkdir()
@@ -231,7 +224,7 @@ def mmdet(folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("write", [grounded, mmdet])
-def test_results_of_detectors_are_read(write: Callable[[Path], Path], tmp_path: Path) -> None:
+def test_results_of_detectors_are_read(write, tmp_path):
     found = read_things(write(tmp_path), {}, None)
     (item,) = found.items
     assert item.category == "chair"
@@ -253,7 +246,7 @@ def many_images(folder: Path) -> Path:
     return folder / "instances.json"
 
 
-def test_of_many_images_only_ours_counts_and_this_is_said(tmp_path: Path) -> None:
+def test_of_many_images_only_ours_counts_and_this_is_said(tmp_path):
     path = many_images(tmp_path)
     found = read_things(path, {}, (W, H), "room.png")
     assert [i.category for i in found.items] == ["chair"]
@@ -262,22 +255,17 @@ def test_of_many_images_only_ours_counts_and_this_is_said(tmp_path: Path) -> Non
         read_things(path, {}, (W, H), "x.png")
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "words"),
-    [
-        ("a.json", [{"id": 1, "annotations": [{"result": []}], "data": {"image": "a"}}],
-         "Label Studio's JSON, expected its export as COCO"),
-        ("a.json", {"a.jpg1": {"filename": "a.jpg", "regions": []}}, "project of VIA"),
-        ("a.json", [{"image": "a.jpg", "id": 7}], r"\[0\].*bbox, segmentation or mask"),
-        ("a.xml", "<?xml?><annotations><version>1.1</version></annotations>", "CVAT's XML"),
-        ("a.xml", "<annotation><object/></annotation>", "an XML of Pascal VOC"),
-        ("a.txt", "56 0.31 0.6 0.2 0.4", "YOLO's text"),
-        ("a.zip", "PK", "unpack it"),
-    ],
-)  # fmt: skip
-def test_what_is_not_read_is_named_with_its_export(
-    name: str, content: Any, words: str, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize(("name", "content", "words"), [
+    ("a.json", [{"id": 1, "annotations": [{"result": []}], "data": {"image": "a"}}],
+     "Label Studio's JSON, expected its export as COCO"),
+    ("a.json", {"a.jpg1": {"filename": "a.jpg", "regions": []}}, "project of VIA"),
+    ("a.json", [{"image": "a.jpg", "id": 7}], r"\[0\].*bbox, segmentation or mask"),
+    ("a.xml", "<?xml?><annotations><version>1.1</version></annotations>", "CVAT's XML"),
+    ("a.xml", "<annotation><object/></annotation>", "an XML of Pascal VOC"),
+    ("a.txt", "56 0.31 0.6 0.2 0.4", "YOLO's text"),
+    ("a.zip", "PK", "unpack it"),
+])  # fmt: skip
+def test_what_is_not_read_is_named_with_its_export(name, content, words, tmp_path):
     text = content if isinstance(content, str) else json.dumps(content)
     (tmp_path / name).write_text(text)
     with pytest.raises(InputError, match=words):
@@ -285,7 +273,7 @@ def test_what_is_not_read_is_named_with_its_export(
 
 
 @pytest.mark.parametrize("nothing", [[], [[]], None])
-def test_a_box_without_mask_is_a_box(nothing: Any, tmp_path: Path) -> None:
+def test_a_box_without_mask_is_a_box(nothing, tmp_path):
     row = {"id": 1, "image_id": 0, "category_id": 1, "bbox": [4, 10, 14, 30],
            "segmentation": nothing}  # fmt: skip
     tree = {"images": [{"id": 0, "width": W, "height": H}], "annotations": [row],

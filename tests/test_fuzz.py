@@ -207,7 +207,7 @@ def check_sane(capture: Capture) -> None:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def whole(tmp_path_factory):
     folder = tiny.write_capture(tmp_path_factory.mktemp("fuzz") / "tiny")
     (folder / "hypotheses.json").write_text(json.dumps(tiny.hypotheses()))
     return folder

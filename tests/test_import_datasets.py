@@ -35,7 +35,7 @@ def prox_room(plain: layouts.Room) -> layouts.Room:
 
 
 @pytest.fixture(scope="module")
-def prox(plain: layouts.Room, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def prox(plain, tmp_path_factory):
     root = tmp_path_factory.mktemp("prox")
     room = prox_room(plain)
     layouts.write_prox(root, room, RECORDING, 3, np.array([1.0, 2.0, 1.5]))
@@ -43,13 +43,11 @@ def prox(plain: layouts.Room, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_the_booths_are_left_out(prox: Path) -> None:
+def test_the_booths_are_left_out(prox):
     assert recordings_of(prox) == [RECORDING]
 
 
-def test_prox_gives_flipped_frames_its_lens_and_the_truth(
-    prox: Path, plain: layouts.Room, tmp_path: Path
-) -> None:
+def test_prox_gives_flipped_frames_its_lens_and_the_truth(prox, plain, tmp_path):
     out, room = tmp_path / "out", prox_room(plain)
     boxes = prox / "boxes" / "bbox3d.json"
     imported("prox", prox, out, tmp_path, recording=RECORDING, boxes=boxes)
@@ -81,7 +79,7 @@ def check_scan(folder: Path, room: layouts.Room) -> None:
         assert (verts[mesh.faces.numpy()][..., 1].max(1) - truth.ground > 0.9 * FLOOR).all()
 
 
-def test_keypoints_of_mirrored_pictures_change_sides(prox: Path, tmp_path: Path) -> None:
+def test_keypoints_of_mirrored_pictures_change_sides(prox, tmp_path):
     imported("prox", prox, tmp_path / "out", tmp_path, recording=RECORDING)
     tree = json.loads((tmp_path / "out" / "keypoints" / "000001_keypoints.json").read_text())
     joints = np.array(tree["people"][0]["pose_keypoints_2d"]).reshape(-1, 3)
@@ -92,7 +90,7 @@ def test_keypoints_of_mirrored_pictures_change_sides(prox: Path, tmp_path: Path)
     assert not hands[1].any()
 
 
-def test_axes_by_columns_are_understood(plain: layouts.Room, tmp_path: Path) -> None:
+def test_axes_by_columns_are_understood(plain, tmp_path):
     layouts.write_prox(tmp_path / "p", prox_room(plain), RECORDING, 1, np.array([0.0, 1, 2]))
     layouts.write_truth(tmp_path / "p" / "boxes", prox_room(plain), columns=True)
     imported(
@@ -102,7 +100,7 @@ def test_axes_by_columns_are_understood(plain: layouts.Room, tmp_path: Path) -> 
     check_truth(tmp_path / "out" / "truth", prox_room(plain))
 
 
-def test_an_unknown_recording_is_named_with_those_there_are(prox: Path, tmp_path: Path) -> None:
+def test_an_unknown_recording_is_named_with_those_there_are(prox, tmp_path):
     with pytest.raises(InputError, match=RECORDING):
         imported("prox", prox, tmp_path / "out", tmp_path, recording="MPH11_1_1")
 
@@ -122,9 +120,7 @@ def walking(frames: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("mirror", [False, True])
-def test_pigraphs_gives_skeletons_with_skin_and_the_truth(
-    plain: layouts.Room, tmp_path: Path, mirror: bool
-) -> None:
+def test_pigraphs_gives_skeletons_with_skin_and_the_truth(plain, tmp_path, mirror):
     joints = walking(4)
     name = "3bHallway_mati2_2014-04-30-22-46-22"
     things = [t for t in plain.things if t.category in ("chair", "bed", "desk", "cabinet", "sofa")]
@@ -135,8 +131,6 @@ def test_pigraphs_gives_skeletons_with_skin_and_the_truth(
     found = imported("pigraphs", tmp_path / "in", tmp_path / "out", tmp_path, recording=name)
     assert any("mirrored" in note for note in found.notes) != mirror
     capture = read_capture(tmp_path / "out")
-    assert capture.bodies is not None
-    assert capture.bodies.joints is not None
     assert np.allclose(capture.bodies.joints.numpy(), joints, atol=1e-5)
     assert capture.bodies.frame.tolist() == [0, 1, 2, 3]
     gap = torch.cdist(capture.bodies.verts[2], capture.bodies.joints[2]).amin(0)
@@ -145,7 +139,7 @@ def test_pigraphs_gives_skeletons_with_skin_and_the_truth(
     gather_evidence(capture)
 
 
-def test_capsules_are_closed_and_outward() -> None:
+def test_capsules_are_closed_and_outward():
     arrays = capsule_people([(0, 0, walking(1)[0])], np.eye(3), 5.0)
     verts, faces = arrays["vertices"][0].astype(float), arrays["faces"]
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
@@ -156,7 +150,7 @@ def test_capsules_are_closed_and_outward() -> None:
     assert len(NAMES) == 25
 
 
-def test_parts_of_an_object_become_one_box(plain: layouts.Room, tmp_path: Path) -> None:
+def test_parts_of_an_object_become_one_box(plain, tmp_path):
     layouts.write_pigraphs(tmp_path, plain, "room_a_b", walking(1), mirror=False)
     boxes = read_segments(tmp_path / "roomd.segs.json")
     known = [t for t in plain.things if t.category not in ("shelves", "lamp", "night_stand")]
@@ -166,9 +160,7 @@ def test_parts_of_an_object_become_one_box(plain: layouts.Room, tmp_path: Path) 
         assert np.allclose(sorted(2 * box.half), sorted(size), atol=1e-6)
 
 
-def test_without_the_bench_the_command_says_where_data_sets_are_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_the_bench_the_command_says_where_data_sets_are_read(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(mover.io.formats, "find_spec", lambda _: None)
     for name in names("dataset"):
         assert run_command("import", [name, str(tmp_path), "--out", str(tmp_path / "out")]) == 2

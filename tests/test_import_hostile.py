@@ -4,7 +4,6 @@ import dataclasses
 import json
 import shutil
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +45,7 @@ def camera() -> At:
 
 
 @pytest.fixture(scope="module")
-def sources() -> Iterator[dict[str, Path]]:
+def sources():
     room = little()
     with tempfile.TemporaryDirectory() as place:
         home = Path(place)
@@ -107,9 +106,7 @@ def files_of(source: Path) -> list[Path]:
 
 
 @pytest.mark.parametrize("format", FORMATS)
-def test_the_little_room_itself_is_taken(
-    sources: dict[str, Path], format: str, tmp_path: Path
-) -> None:
+def test_the_little_room_itself_is_taken(sources, format, tmp_path):
     assert import_or_refuse(format, copied(sources[format], tmp_path), tmp_path)
 
 
@@ -122,9 +119,7 @@ def test_the_little_room_itself_is_taken(
     format=st.sampled_from(FORMATS), which=st.integers(0, 100), where=st.floats(0, 1),
     junk=st.binary(min_size=1, max_size=8), cut=st.booleans(),
 )  # fmt: skip
-def test_no_flipped_or_missing_bytes_raise_anything_else(
-    sources: dict[str, Path], format: str, which: int, where: float, junk: bytes, cut: bool
-) -> None:
+def test_no_flipped_or_missing_bytes_raise_anything_else(sources, format, which, where, junk, cut):
     with tempfile.TemporaryDirectory() as place:
         home = Path(place) / "home"
         source = copied(sources[format], home)
@@ -164,9 +159,7 @@ def ways_of(tree: Any, way: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     format=st.sampled_from([f for f in FORMATS if f not in ("glb", "masks:npz")]),
     which=st.integers(0, 10**6), value=JUNK,
 )  # fmt: skip
-def test_no_junk_in_any_json_field_raises_anything_else(
-    sources: dict[str, Path], format: str, which: int, value: Any
-) -> None:
+def test_no_junk_in_any_json_field_raises_anything_else(sources, format, which, value):
     with tempfile.TemporaryDirectory() as place:
         home = Path(place) / "home"
         source = copied(sources[format], home)
@@ -188,7 +181,7 @@ def test_no_junk_in_any_json_field_raises_anything_else(
         import_or_refuse(format, source, home)
 
 
-def test_pickles_in_arrays_do_not_run(tmp_path: Path) -> None:
+def test_pickles_in_arrays_do_not_run(tmp_path):
     mark = tmp_path / "mark"
     bomb = layouts.write_bomb(tmp_path / "a.npz", mark)
     with pytest.raises(InputError, match="pickled"):
@@ -199,7 +192,7 @@ def test_pickles_in_arrays_do_not_run(tmp_path: Path) -> None:
     assert not mark.exists()
 
 
-def test_zip_bombs_are_not_unpacked(tmp_path: Path) -> None:
+def test_zip_bombs_are_not_unpacked(tmp_path):
     with pytest.raises(InputError, match="bytes"):
         read_instances(layouts.write_zip_bomb(tmp_path / "a.npz"), {}, None)
     head = str({"descr": "<f8", "fortran_order": False, "shape": (10**9, 3)}).encode()
@@ -211,7 +204,7 @@ def test_zip_bombs_are_not_unpacked(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["ply", "off", "obj"])
-def test_headers_of_a_thousand_million_vertices_are_refused(tmp_path: Path, kind: str) -> None:
+def test_headers_of_a_thousand_million_vertices_are_refused(tmp_path, kind):
     source = layouts.write_total3d(tmp_path / "in", little())
     for path in (source / "output").glob("*.obj"):
         path.unlink()
@@ -228,7 +221,7 @@ def test_headers_of_a_thousand_million_vertices_are_refused(tmp_path: Path, kind
 
 
 @pytest.mark.parametrize("name", ["../../escaped", "/tmp/escaped", "..", "a/b", "CON:", "\0", ""])
-def test_names_cannot_leave_the_folder(tmp_path: Path, name: str) -> None:
+def test_names_cannot_leave_the_folder(tmp_path, name):
     room = little()
     things = [dataclasses.replace(t, name=name or "x") for t in room.things[:1]]
     source = layouts.write_boxes(
@@ -241,7 +234,7 @@ def test_names_cannot_leave_the_folder(tmp_path: Path, name: str) -> None:
     import_or_refuse("boxes", source, tmp_path)
 
 
-def test_a_gltf_cannot_bring_other_files_along(tmp_path: Path) -> None:
+def test_a_gltf_cannot_bring_other_files_along(tmp_path):
     secret = tmp_path / "secret.png"
     layouts.picture((8, 8)).save(secret)
     path = layouts.write_glb(tmp_path / "in" / "a.glb", little())
@@ -259,7 +252,7 @@ def test_a_gltf_cannot_bring_other_files_along(tmp_path: Path) -> None:
         chosen("FORMAT", "glb", *IMPORTED)(path, Hints(work=tmp_path))
 
 
-def test_xml_bombs_are_refused(tmp_path: Path) -> None:
+def test_xml_bombs_are_refused(tmp_path):
     from mover.io.files.cameras import read_camera_file
 
     path = tmp_path / "a.xml"

@@ -44,7 +44,7 @@ def drawn() -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_layout_gives_the_same_masks(tmp_path: Path, kind: str) -> None:
+def test_every_layout_gives_the_same_masks(tmp_path, kind):
     masks = drawn()
     files = layouts.write_masks(tmp_path / "in", masks, WORDS)
     found = read_instances(files[kind], {}, None)
@@ -58,7 +58,7 @@ def test_every_layout_gives_the_same_masks(tmp_path: Path, kind: str) -> None:
     assert words == (["object"] * 4 if kind in NAMELESS else WORDS)
 
 
-def test_polygons_fill_what_they_surround(tmp_path: Path) -> None:
+def test_polygons_fill_what_they_surround(tmp_path):
     row = {"id": 1, "image_id": 1, "category_id": 1, "bbox": [10, 10, 20, 15],
            "segmentation": [[10, 10, 30, 10, 30, 25, 10, 25]]}  # fmt: skip
     tree = {"images": [{"id": 1, "width": 64, "height": 48}], "annotations": [row],
@@ -71,7 +71,7 @@ def test_polygons_fill_what_they_surround(tmp_path: Path) -> None:
     assert mask.sum() == 300
 
 
-def test_shapes_of_labelme_are_filled_and_those_of_a_group_are_one(tmp_path: Path) -> None:
+def test_shapes_of_labelme_are_filled_and_those_of_a_group_are_one(tmp_path):
     shapes = [
         ("chair", [[10, 10], [30, 10], [30, 25], [10, 25]], "polygon", 4),
         ("lamp", [[50, 40], [45, 30]], "rectangle", None),
@@ -92,7 +92,7 @@ def test_shapes_of_labelme_are_filled_and_those_of_a_group_are_one(tmp_path: Pat
         read_instances(bad, {}, None)
 
 
-def test_names_of_the_user_win(tmp_path: Path) -> None:
+def test_names_of_the_user_win(tmp_path):
     files = layouts.write_masks(tmp_path / "in", drawn(), WORDS)
     names = {"0": "table", "1": "bed"}
     for kind in NAMELESS:
@@ -100,7 +100,7 @@ def test_names_of_the_user_win(tmp_path: Path) -> None:
         assert [i.category for i in found.items][:2] == ["table", "bed"], kind
 
 
-def test_masks_of_another_size_are_stretched_and_of_another_shape_refused(tmp_path: Path) -> None:
+def test_masks_of_another_size_are_stretched_and_of_another_shape_refused(tmp_path):
     files = layouts.write_masks(tmp_path / "in", drawn(), WORDS)
     found = fitted(read_instances(files["npz"], {}, None), (128, 96))
     assert found.items[0].mask is not None
@@ -112,7 +112,7 @@ def test_masks_of_another_size_are_stretched_and_of_another_shape_refused(tmp_pa
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the shared data is not here")
 class TestRealFiles:
-    def test_real_results_of_coco_have_their_runs(self) -> None:
+    def test_real_results_of_coco_have_their_runs(self):
         path = DATA / "formats" / "coco_instances_val2014_fakesegm100_results.json"
         rows = [row for row in json.loads(path.read_text()) if row["image_id"] == 42]
         found = list_instances(At(rows, path.name), {}, None).items
@@ -124,7 +124,7 @@ class TestRealFiles:
             assert layouts.compressed(layouts.runs_of(mask)) == row["segmentation"]["counts"]
         assert found[0].category == "dog"
 
-    def test_real_total3d_and_masks_of_its_boxes_become_one_capture(self, tmp_path: Path) -> None:
+    def test_real_total3d_and_masks_of_its_boxes_become_one_capture(self, tmp_path):
         rows = json.loads((DATA / "total3d_1" / "input" / "detections.json").read_text())
         masks = np.zeros((len(rows), 530, 730), dtype=bool)
         for mask, row in zip(masks, rows, strict=True):
@@ -155,7 +155,7 @@ def of_boxes(room: layouts.Room, things: list[layouts.Thing], path: Path, **more
     return path
 
 
-def test_parts_come_in_any_order_and_stay(plain: layouts.Room, tmp_path: Path) -> None:
+def test_parts_come_in_any_order_and_stay(plain, tmp_path):
     """Masks first and the scene later is the same capture as the other way round."""
     words = np.array([thing.category for thing in plain.things])
     sources = {
@@ -178,7 +178,7 @@ def test_parts_come_in_any_order_and_stay(plain: layouts.Room, tmp_path: Path) -
         assert torch.allclose(a.box, b.box)
 
 
-def test_a_scene_without_annotations_finds_its_masks(plain: layouts.Room, tmp_path: Path) -> None:
+def test_a_scene_without_annotations_finds_its_masks(plain, tmp_path):
     source = layouts.write_glb(tmp_path / "in.glb", plain)
     layouts.picture(plain.size).save(tmp_path / "photo.png")
     args = ImportArgs(
@@ -191,7 +191,7 @@ def test_a_scene_without_annotations_finds_its_masks(plain: layouts.Room, tmp_pa
     assert {p.id: p.annotation for p in found.scene.objects} == {n: i for i, n in enumerate(order)}
 
 
-def test_a_new_tilt_keeps_box_centres_in_the_camera(plain: layouts.Room, tmp_path: Path) -> None:
+def test_a_new_tilt_keeps_box_centres_in_the_camera(plain, tmp_path):
     source = layouts.write_total3d(tmp_path / "in", plain)
     first = capture_of("total3d", source, tmp_path)
     camera = {**camera_at(plain).value}
@@ -212,9 +212,7 @@ def test_a_new_tilt_keeps_box_centres_in_the_camera(plain: layouts.Room, tmp_pat
 
 
 @pytest.mark.parametrize("tracks", [[4, 9], [4]])
-def test_people_keep_their_tracks_and_frames(
-    plain: layouts.Room, tmp_path: Path, tracks: list[int]
-) -> None:
+def test_people_keep_their_tracks_and_frames(plain, tmp_path, tracks):
     """(n, 1, h, w) alone is n things; with one object id it is one thing in n frames."""
     w, h = plain.size
     stack = np.zeros((3, len(tracks), h, w), dtype=bool)
@@ -227,7 +225,6 @@ def test_people_keep_their_tracks_and_frames(
         ImportArgs("total3d", source, out, people_masks=tmp_path / "people.npz", fps=5.0), tmp_path
     )
     people = read_capture(out).people
-    assert people is not None
     rows = list(zip(people.frame.tolist(), people.person.tolist(), strict=True))
     every = [(frame, track) for frame in range(3) for track in tracks]
     assert rows == [row for row in every if row != (1, 9)]
@@ -236,9 +233,7 @@ def test_people_keep_their_tracks_and_frames(
         assert (decode(people.masks, row).numpy() == truth).all()
 
 
-def test_masks_alone_make_a_part_and_what_is_missing_is_said(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_masks_alone_make_a_part_and_what_is_missing_is_said(tmp_path, capsys):
     files = layouts.write_masks(tmp_path / "in", drawn(), WORDS)
     run_import(ImportArgs("masks", files["coco_text"], tmp_path / "out"), tmp_path)
     said = capsys.readouterr().out
@@ -248,7 +243,7 @@ def test_masks_alone_make_a_part_and_what_is_missing_is_said(
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["objects.json"]
 
 
-def test_nothing_is_written_when_a_part_does_not_fit(plain: layouts.Room, tmp_path: Path) -> None:
+def test_nothing_is_written_when_a_part_does_not_fit(plain, tmp_path):
     capture_of("total3d", layouts.write_total3d(tmp_path / "in", plain), tmp_path)
     before = {p: p.read_bytes() for p in (tmp_path / "out").rglob("*") if p.is_file()}
     Image.new("RGB", (10, 10)).save(tmp_path / "small.png")
@@ -261,7 +256,7 @@ def test_nothing_is_written_when_a_part_does_not_fit(plain: layouts.Room, tmp_pa
     assert before == after
 
 
-def test_an_empty_import_changes_nothing(plain: layouts.Room, tmp_path: Path) -> None:
+def test_an_empty_import_changes_nothing(plain, tmp_path):
     imported("total3d", layouts.write_total3d(tmp_path / "in", plain), tmp_path / "out", tmp_path)
     before = {p: p.read_bytes() for p in (tmp_path / "out").rglob("*.json")}
     import_into(tmp_path / "out", Parts(name="nothing"))

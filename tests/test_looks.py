@@ -55,7 +55,7 @@ def colour_of(path: Path) -> Any:
 
 
 @pytest.mark.parametrize("way", NAMED)
-def test_a_texture_is_found_as_people_name_it_and_goes_along(way: str, tmp_path: Path) -> None:
+def test_a_texture_is_found_as_people_name_it_and_goes_along(way, tmp_path):
     path = textured(tmp_path / "in", *NAMED[way])
     assert colour_of(path) == RED
     assert looks_lost(path) == ""
@@ -63,23 +63,18 @@ def test_a_texture_is_found_as_people_name_it_and_goes_along(way: str, tmp_path:
     assert colour_of(copy_mesh(path, tmp_path / "out", "chair_0")) == RED
 
 
-@pytest.mark.parametrize(
-    ("line", "library", "said"),
-    [
-        ("map_Kd oak.png", "mtllib a.mtl", "a.obj loses the texture oak.png, which is not beside"),
-        ("map_Kd ../wood.png", "mtllib b.mtl", "a.obj loses the materials of b.mtl, which is not"),
-        ("map_Kd -s 4 4 wood.png", "mtllib a.mtl", "how wood.png is shifted or repeated"),
-    ],
-)
-def test_what_is_lost_of_the_looks_is_said(
-    line: str, library: str, said: str, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize(("line", "library", "said"), [
+    ("map_Kd oak.png", "mtllib a.mtl", "a.obj loses the texture oak.png, which is not beside"),
+    ("map_Kd ../wood.png", "mtllib b.mtl", "a.obj loses the materials of b.mtl, which is not"),
+    ("map_Kd -s 4 4 wood.png", "mtllib a.mtl", "how wood.png is shifted or repeated"),
+])  # fmt: skip
+def test_what_is_lost_of_the_looks_is_said(line, library, said, tmp_path):
     path = textured(tmp_path, line, "wood.png", library)
     assert said in looks_lost(path)
     assert len(load_parts(At(path.name, "here"), path).to_mesh().faces) == 2
 
 
-def test_pictures_of_a_gltf_are_found_in_any_case(tmp_path: Path) -> None:
+def test_pictures_of_a_gltf_are_found_in_any_case(tmp_path):
     import trimesh
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
@@ -105,7 +100,7 @@ def test_pictures_of_a_gltf_are_found_in_any_case(tmp_path: Path) -> None:
     assert "loses the texture textures\\wood.PNG" in looks_lost(path)
 
 
-def test_groups_materials_and_indices_from_the_end_are_one_mesh(tmp_path: Path) -> None:
+def test_groups_materials_and_indices_from_the_end_are_one_mesh(tmp_path):
     part = "o part{i}\nv {i} 0 0\nv {i} 1 0\nv {i} 0 1\ng g{i}\nusemtl m{i}\nf -3 -2 -1\n"
     path = tmp_path / "many.obj"
     text = "mtllib many.mtl\n# M\xf6bel\n" + "".join(part.format(i=i) for i in range(3000))
@@ -118,7 +113,7 @@ def test_groups_materials_and_indices_from_the_end_are_one_mesh(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("kind", ["off", "stl", "ply"])
-def test_a_byte_that_is_not_utf_8_does_not_matter(kind: str, tmp_path: Path) -> None:
+def test_a_byte_that_is_not_utf_8_does_not_matter(kind, tmp_path):
     import trimesh
 
     path = tmp_path / f"a.{kind}"
@@ -155,7 +150,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_what_is_no_mesh_is_named_for_what_it_is(name: str, tmp_path: Path) -> None:
+def test_what_is_no_mesh_is_named_for_what_it_is(name, tmp_path):
     content, words = BAD[name]
     (tmp_path / name).write_text(content)
     with pytest.raises(InputError, match=words) as caught:
@@ -178,18 +173,13 @@ def gltf(path: Path, nodes: list[Any], count: int = 60_000, **more: Any) -> Path
     return path
 
 
-@pytest.mark.parametrize(
-    ("nodes", "more", "words"),
-    [
-        ([{"mesh": 0}] * 800, {}, "16000000 faces in all places of its meshes, expected at most"),
-        ([{"mesh": 0}] * 40_000, {}, "40000 nodes, expected at most 10000"),
-        ([{"mesh": 0}], {"count": (1 << 27) - 1}, "134217727 items of no bytes, expected at most"),
-        ([{"mesh": 0}], {"extensionsRequired": ["KHR_draco_mesh_compression"]}, "packed by Draco"),
-    ],
-)
-def test_files_that_unfold_or_are_packed_are_refused_at_once(
-    nodes: list[Any], more: dict[str, Any], words: str, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize(("nodes", "more", "words"), [
+    ([{"mesh": 0}] * 800, {}, "16000000 faces in all places of its meshes, expected at most"),
+    ([{"mesh": 0}] * 40_000, {}, "40000 nodes, expected at most 10000"),
+    ([{"mesh": 0}], {"count": (1 << 27) - 1}, "134217727 items of no bytes, expected at most"),
+    ([{"mesh": 0}], {"extensionsRequired": ["KHR_draco_mesh_compression"]}, "packed by Draco"),
+])  # fmt: skip
+def test_files_that_unfold_or_are_packed_are_refused_at_once(nodes, more, words, tmp_path):
     path = gltf(tmp_path / "a.glb", nodes, **more)
     with pytest.raises(InputError, match=words):
         load_arrays(At(path.name, "here"), path)

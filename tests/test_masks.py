@@ -31,7 +31,7 @@ def image_of(code: bytes, shape: Any) -> np.ndarray:
 
 
 @given(MASKS)
-def test_both_codes_and_the_encoder_give_the_mask_back(mask: np.ndarray) -> None:
+def test_both_codes_and_the_encoder_give_the_mask_back(mask):
     counts = runs(mask)
     height, width = mask.shape
     size = [height, width]
@@ -43,12 +43,12 @@ def test_both_codes_and_the_encoder_give_the_mask_back(mask: np.ndarray) -> None
 
 
 @given(st.lists(st.integers(0, 10**7), min_size=1, max_size=40))
-def test_a_compressed_code_holds_its_runs(counts: list[int]) -> None:
+def test_a_compressed_code_holds_its_runs(counts):
     assert run_lengths(compressed(counts).encode()).tolist() == counts
 
 
 @given(st.binary(max_size=12) | st.text(max_size=12))
-def test_a_code_of_noise_is_refused_or_fits_the_image(code: bytes | str) -> None:
+def test_a_code_of_noise_is_refused_or_fits_the_image(code):
     try:
         found = from_coco({"size": [3, 5], "counts": code}, 3, 5, WHERE)
     except InputError as error:
@@ -57,7 +57,7 @@ def test_a_code_of_noise_is_refused_or_fits_the_image(code: bytes | str) -> None
         assert image_of(found, (3, 5)).shape == (3, 5)
 
 
-def test_a_polygon_covers_the_pixels_whose_centres_it_holds() -> None:
+def test_a_polygon_covers_the_pixels_whose_centres_it_holds():
     box = [[2, 1, 7, 1, 7, 4, 2, 4]]
     found = image_of(from_coco(box, 6, 9, WHERE), (6, 9))
     expected = np.zeros((6, 9), dtype=bool)
@@ -66,7 +66,7 @@ def test_a_polygon_covers_the_pixels_whose_centres_it_holds() -> None:
     assert tight_box(torch.from_numpy(found)).tolist() == [2, 1, 7, 4]
 
 
-def test_polygons_are_joined_and_clipped() -> None:
+def test_polygons_are_joined_and_clipped():
     outlines = [[-3, -2, 2, -2, 2, 3, -3, 3], [5, 0, 8, 0, 8, 6, 5, 6]]
     found = image_of(from_coco(outlines, 6, 7, WHERE), (6, 7))
     expected = np.zeros((6, 7), dtype=bool)
@@ -74,40 +74,37 @@ def test_polygons_are_joined_and_clipped() -> None:
     assert (found == expected).all()
 
 
-@pytest.mark.parametrize(
-    ("segmentation", "words"),
-    [
-        ([], "no polygon"),
-        ([[0, 0, 1, 1]], "4 items"),
-        ([[0, 0, 1, 1, 2, 2, 3]], "7 items"),
-        ([[0, 0, 1, float("nan"), 2, 2]], "far outside"),
-        ([[0, 0, 1, 1e300, 2, 2]], "far outside"),
-        ([[0, 0, 1, "a", 2, 2]], r"polygon 0 with text \('a'\), expected .* without quotes"),
-        ([["0.5", "0", "1", "1", "2", "2"]], r"text \('0.5'\)"),
-        ([3], "3"),
-        ([[]], "no polygon"),
-        ("abc", "compressed code"),
-        ("{'size': [3, 5], 'counts': [14]}", "sum to 14"),
-        ("[[[[", "compressed code"),
-        ({"size": [3, 5], "counts": "b'ä'"}, "compressed code"),
-        (7, "int"),
-        ({"counts": [15]}, "has size None"),
-        ({"size": [5, 3], "counts": [15]}, r"has size \[5, 3\], expected \[3, 5\]"),
-        ({"size": [3, 5]}, "NoneType"),
-        ({"size": [3, 5], "counts": [14]}, "sum to 14"),
-        ({"size": [3, 5], "counts": [20, -5]}, "a negative run"),
-        ({"size": [3, 5], "counts": [15.0]}, "whole numbers"),
-        ({"size": [3, 5], "counts": [True] * 15}, "whole numbers"),
-        ({"size": [3, 5], "counts": [10**30]}, "whole numbers"),
-        ({"size": [3, 5], "counts": ""}, "cut off"),
-        ({"size": [3, 5], "counts": "o"}, "cut off"),
-        ({"size": [3, 5], "counts": "oooooooo0"}, "35 bits"),
-        ({"size": [3, 5], "counts": "ä"}, "compressed code"),
-        ({"size": [3, 5], "counts": " "}, "characters"),
-        ({"size": [3, 5], "counts": "40"}, "sum to"),
-    ],
-)
-def test_a_malformed_mask_is_told_with_its_place(segmentation: object, words: str) -> None:
+@pytest.mark.parametrize(("segmentation", "words"), [
+    ([], "no polygon"),
+    ([[0, 0, 1, 1]], "4 items"),
+    ([[0, 0, 1, 1, 2, 2, 3]], "7 items"),
+    ([[0, 0, 1, float("nan"), 2, 2]], "far outside"),
+    ([[0, 0, 1, 1e300, 2, 2]], "far outside"),
+    ([[0, 0, 1, "a", 2, 2]], r"polygon 0 with text \('a'\), expected .* without quotes"),
+    ([["0.5", "0", "1", "1", "2", "2"]], r"text \('0.5'\)"),
+    ([3], "3"),
+    ([[]], "no polygon"),
+    ("abc", "compressed code"),
+    ("{'size': [3, 5], 'counts': [14]}", "sum to 14"),
+    ("[[[[", "compressed code"),
+    ({"size": [3, 5], "counts": "b'ä'"}, "compressed code"),
+    (7, "int"),
+    ({"counts": [15]}, "has size None"),
+    ({"size": [5, 3], "counts": [15]}, r"has size \[5, 3\], expected \[3, 5\]"),
+    ({"size": [3, 5]}, "NoneType"),
+    ({"size": [3, 5], "counts": [14]}, "sum to 14"),
+    ({"size": [3, 5], "counts": [20, -5]}, "a negative run"),
+    ({"size": [3, 5], "counts": [15.0]}, "whole numbers"),
+    ({"size": [3, 5], "counts": [True] * 15}, "whole numbers"),
+    ({"size": [3, 5], "counts": [10**30]}, "whole numbers"),
+    ({"size": [3, 5], "counts": ""}, "cut off"),
+    ({"size": [3, 5], "counts": "o"}, "cut off"),
+    ({"size": [3, 5], "counts": "oooooooo0"}, "35 bits"),
+    ({"size": [3, 5], "counts": "ä"}, "compressed code"),
+    ({"size": [3, 5], "counts": " "}, "characters"),
+    ({"size": [3, 5], "counts": "40"}, "sum to"),
+])  # fmt: skip
+def test_a_malformed_mask_is_told_with_its_place(segmentation, words):
     with pytest.raises(InputError, match=words) as caught:
         from_coco(segmentation, 3, 5, WHERE)
     assert str(caught.value).startswith(WHERE)
@@ -126,7 +123,7 @@ WAYS = {
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_a_mask_is_read_as_people_write_it(way: str) -> None:
+def test_a_mask_is_read_as_people_write_it(way):
     expected = np.zeros((6, 9), dtype=bool)
     expected[1:4, 2:7] = True
     written = WAYS[way](compressed(runs(expected)))
@@ -135,7 +132,7 @@ def test_a_mask_is_read_as_people_write_it(way: str) -> None:
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the shared data is not here")
 class TestRealFiles:
-    def test_results_of_cocos_own_tools_decode_as_pycocotools_does(self) -> None:
+    def test_results_of_cocos_own_tools_decode_as_pycocotools_does(self):
         file = DATA / "formats" / "coco_instances_val2014_fakesegm100_results.json"
         rows = json.loads(file.read_text())
         for row in rows[::40]:
@@ -147,7 +144,7 @@ class TestRealFiles:
             assert tight_box(torch.from_numpy(found)).tolist() == corners(coco.toBbox(code))
             assert run_lengths(code["counts"].encode()).tolist() == runs(found)
 
-    def test_a_masklet_of_sa_v_decodes_to_masks_of_the_right_area(self) -> None:
+    def test_a_masklet_of_sa_v_decodes_to_masks_of_the_right_area(self):
         tree = json.loads((DATA / "formats/sav_000001_manual.json").read_text())
         codes = [code for frame in tree["masklet"][:3] for code in frame]
         assert codes

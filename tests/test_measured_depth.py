@@ -2,7 +2,6 @@
 
 import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,12 +18,7 @@ from mover.geometry.placement import place_in
 from mover.geometry.raster import Crops, Topology, look
 from mover.io.capture.folder import folder_parts, read_capture, write_capture
 from mover.io.capture.merge import import_into
-from mover.io.files.images import (
-    find_depth_file,
-    read_depth,
-    read_depth_image,
-    reference_frame,
-)
+from mover.io.files.images import find_depth_file, read_depth, read_depth_image, reference_frame
 from mover.stages.config import PlaceConfig
 from mover.stages.objects.gather_depth import DepthImageInputs, gather_depth
 from mover.stages.objects.place_inputs import coarser_image
@@ -43,7 +37,6 @@ def true_inputs(metric: bool = True) -> DepthImageInputs:
     verts = place_in(objects.verts, layout, camera.R_cam_world)
     whole = Crops(camera.K[None].expand(len(verts), 3, 3), 360, 640)
     seen = look(verts, Topology(objects.faces, objects.edges), whole, depth=True)[1]
-    assert seen is not None
     drawn = torch.where(seen.covered, seen.nearest, torch.inf)
     depth = torch.minimum(depth, drawn.amin(0))
     depth = torch.where(depth < 50, depth, torch.nan)
@@ -54,9 +47,7 @@ def true_inputs(metric: bool = True) -> DepthImageInputs:
 
 def errors(found: Measured | None, inputs: DepthImageInputs) -> torch.Tensor:
     """Logarithm of found over true depth within the masks."""
-    assert found is not None
     true = inputs.image.measured
-    assert true is not None
     inside = (inputs.image.masks > 0.99) & (true.depth > 0) & (found.depth > 0)
     return (found.depth / true.depth)[inside].log()
 
@@ -66,7 +57,7 @@ def with_values(inputs: DepthImageInputs, values: torch.Tensor, metric: bool) ->
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.15, 0.85])
-def test_the_factor_of_a_metric_network_is_found(factor: float):
+def test_the_factor_of_a_metric_network_is_found(factor):
     inputs = true_inputs()
     scaled = with_values(inputs, factor * inputs.depth.values, True)
     assert float(errors(gather_depth(scaled), inputs).abs().median()) < 0.02
@@ -80,7 +71,7 @@ def test_factor_and_shift_of_an_inverse_depth_are_found():
 
 
 @pytest.mark.parametrize("metric", [True, False])
-def test_an_object_that_stands_wrong_does_not_pull_the_others(metric: bool):
+def test_an_object_that_stands_wrong_does_not_pull_the_others(metric):
     inputs = true_inputs()
     far = inputs.layout.t_world_object.clone()
     far[1] *= 1.4
@@ -107,7 +98,7 @@ def test_a_wrong_distance_costs_the_same_in_windows_of_fewer_pixels():
     assert torch.allclose(costs[0], costs[1], rtol=0.1)
 
 
-def test_a_capture_keeps_its_depth(tmp_path: Path, small_room):
+def test_a_capture_keeps_its_depth(tmp_path, small_room):
     shape = small_room.capture.scene.camera.height, small_room.capture.scene.camera.width
     for metric in (True, False):
         values = torch.rand(shape, generator=torch.Generator().manual_seed(1)) + 1
@@ -122,7 +113,7 @@ def test_a_capture_keeps_its_depth(tmp_path: Path, small_room):
         write_capture(small_room.capture, tmp_path / "True")
 
 
-def test_an_import_takes_measured_depth_along_and_the_newer_one_counts(tmp_path: Path, small_room):
+def test_an_import_takes_measured_depth_along_and_the_newer_one_counts(tmp_path, small_room):
     shape = small_room.capture.scene.camera.height, small_room.capture.scene.camera.width
     values = torch.rand(shape, generator=torch.Generator().manual_seed(1)) + 1
     for name, metric in (("metres", True), ("inverse", False)):
@@ -140,7 +131,7 @@ def test_an_import_takes_measured_depth_along_and_the_newer_one_counts(tmp_path:
     assert "disparity/" not in made.written
 
 
-def test_inverse_depth_may_be_an_array_or_a_grey_picture(tmp_path: Path, small_room):
+def test_inverse_depth_may_be_an_array_or_a_grey_picture(tmp_path, small_room):
     camera = small_room.capture.scene.camera
     folder = tmp_path / "disparity"
     folder.mkdir()
@@ -161,7 +152,7 @@ WHOLE_VIDEOS = {  # of MegaSaM, which halves the sides, and of VGGT, whose sides
 
 @pytest.mark.parametrize("key", WHOLE_VIDEOS)
 def test_depths_of_a_whole_video_give_the_frame_of_the_reference_picture(
-    key: str, tmp_path: Path, small_room, caplog
+    key, tmp_path, small_room, caplog
 ):
     camera = small_room.capture.scene.camera
     dtype, shape, tail = WHOLE_VIDEOS[key]
@@ -185,7 +176,7 @@ def test_depths_of_a_whole_video_give_the_frame_of_the_reference_picture(
 
 @pytest.mark.parametrize("kind", ["npy", "png", "npz"])
 @pytest.mark.parametrize("folder", ["depth", "disparity"])
-def test_a_pipe_as_depth_is_refused_at_once(kind: str, folder: str, tmp_path: Path, small_room):
+def test_a_pipe_as_depth_is_refused_at_once(kind, folder, tmp_path, small_room):
     (tmp_path / folder).mkdir()
     os.mkfifo(tmp_path / folder / f"000000.{kind}")
     file, metric = find_depth_file(tmp_path)
@@ -193,7 +184,7 @@ def test_a_pipe_as_depth_is_refused_at_once(kind: str, folder: str, tmp_path: Pa
         read_depth(file, small_room.capture.scene.camera, metric=metric)
 
 
-def test_what_is_wrong_with_measured_depth_is_one_sentence(tmp_path: Path, small_room):
+def test_what_is_wrong_with_measured_depth_is_one_sentence(tmp_path, small_room):
     camera = small_room.capture.scene.camera
     assert find_depth_file(tmp_path) is None
     (tmp_path / "depth").mkdir()

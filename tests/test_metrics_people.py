@@ -38,7 +38,7 @@ from mover.evaluate.contact import (
 )
 
 
-def test_a_body_that_sinks_into_a_box_collides_by_its_share_and_depth() -> None:
+def test_a_body_that_sinks_into_a_box_collides_by_its_share_and_depth():
     box = [StandingMesh(cuboid(1, 1, 1))]  # its top is at 1
     touch = gather_touch(some_people(grid_body(0.92, 1.32)), box, None, 10, 0.05)
     assert non_collision(touch) == pytest.approx(4 / 5)  # rows at .92, 1.02, 1.12, 1.22, 1.32
@@ -46,7 +46,7 @@ def test_a_body_that_sinks_into_a_box_collides_by_its_share_and_depth() -> None:
     assert contact_f1(touch) is None
 
 
-def test_a_body_just_above_a_box_touches_it_without_colliding() -> None:
+def test_a_body_just_above_a_box_touches_it_without_colliding():
     box = [StandingMesh(cuboid(1, 1, 1))]
     above = some_people(grid_body(1.04, 1.44))
     touch = gather_touch(above, box, None, 10, 0.05)
@@ -54,7 +54,7 @@ def test_a_body_just_above_a_box_touches_it_without_colliding() -> None:
     assert int((touch.near.surface <= 0.05).sum()) == 5
 
 
-def test_contact_scores_are_means_over_bodies() -> None:
+def test_contact_scores_are_means_over_bodies():
     box = [StandingMesh(cuboid(1, 1, 1))]
     both = some_people(torch.cat([grid_body(0.92, 1.32), grid_body(1.04, 1.44)]))
     touch = gather_touch(both, box, None, 10, 0.05)
@@ -62,7 +62,7 @@ def test_contact_scores_are_means_over_bodies() -> None:
     assert contact(touch) == pytest.approx(0.5)
 
 
-def test_contact_f1_compares_the_touching_vertices_with_the_true_ones() -> None:
+def test_contact_f1_compares_the_touching_vertices_with_the_true_ones():
     box = [StandingMesh(cuboid(1, 1, 1))]
     true = some_people(grid_body(1.0, 1.4, 9))  # heights 1, 1.05, 1.1, ...: two rows touch
     high = some_people(grid_body(1.04, 1.44, 9))  # one row touches
@@ -73,7 +73,7 @@ def test_contact_f1_compares_the_touching_vertices_with_the_true_ones() -> None:
     assert contact_f1(Touch(nobody, nobody, nobody, 0.05)) == 1
 
 
-def test_contact_f1_is_paired_by_frame_and_person_not_by_row() -> None:
+def test_contact_f1_is_paired_by_frame_and_person_not_by_row():
     box = [StandingMesh(cuboid(1, 1, 1))]
     bodies = some_people(torch.cat([grid_body(1.0, 1.4), grid_body(1.04, 1.44), grid_body(2, 3)]))
     order = torch.tensor([2, 0, 1])
@@ -82,12 +82,11 @@ def test_contact_f1_is_paired_by_frame_and_person_not_by_row() -> None:
     assert contact_f1(gather_touch(bodies, box, truth, 10, 0.05)) == 1
     later = replace(bodies, frame=bodies.frame + 1)  # frames 1, 2, 3: of the true 0, 1, 2
     touch = gather_touch(later, box, truth, 10, 0.05)
-    assert touch.shared is not None
     assert touch.shared.signed.shape[0] == 2
     assert touch.near.signed.shape[0] == 3
 
 
-def test_distances_within_reach_are_those_to_all_objects_without_culling() -> None:
+def test_distances_within_reach_are_those_to_all_objects_without_culling():
     rng = torch.Generator().manual_seed(0)
     verts = torch.rand(3, 400, 3, generator=rng, dtype=F64) * 3 - 1.5
     sphere = mesh_of(trimesh.creation.icosphere(3, 0.8))
@@ -106,7 +105,7 @@ def test_distances_within_reach_are_those_to_all_objects_without_culling() -> No
 
 
 @given(st.integers(1, 500), st.integers(2, 100))
-def test_rows_are_thinned_evenly_and_each_at_most_once(rows: int, count: int) -> None:
+def test_rows_are_thinned_evenly_and_each_at_most_once(rows, count):
     picked = evenly(rows, count).tolist()
     assert len(set(picked)) == len(picked) == min(rows, count)
     assert picked[0] == 0
@@ -115,7 +114,7 @@ def test_rows_are_thinned_evenly_and_each_at_most_once(rows: int, count: int) ->
     assert len(steps) == 0 or steps.max() - steps.min() <= 1
 
 
-def test_soles_under_the_floor_are_counted_and_measured() -> None:
+def test_soles_under_the_floor_are_counted_and_measured():
     standing = Standing(torch.tensor([[0.1, 0.0, -0.005, -0.02], [0.3, -0.04, 0, 0]]), 0.01)
     assert ground_penetration_frequency(standing) == pytest.approx(2 / 8)
     assert ground_penetration_distance(standing) == pytest.approx(0.03)
@@ -124,7 +123,7 @@ def test_soles_under_the_floor_are_counted_and_measured() -> None:
     assert ground_penetration_distance(above) == 0
 
 
-def test_procrustes_undoes_every_similarity_but_no_mirror() -> None:
+def test_procrustes_undoes_every_similarity_but_no_mirror():
     rng = np.random.default_rng(1)
     points = torch.tensor(rng.normal(size=(5, 30, 3)))
     turns = torch.tensor(Rotation.random(5, rng).as_matrix())
@@ -135,7 +134,7 @@ def test_procrustes_undoes_every_similarity_but_no_mirror() -> None:
     assert (procrustes(points, mirrored) - mirrored).norm(dim=-1).mean() > 0.1
 
 
-def test_procrustes_finds_the_rotation_of_another_library_and_the_best_scale() -> None:
+def test_procrustes_finds_the_rotation_of_another_library_and_the_best_scale():
     rng = np.random.default_rng(2)
     points, target = rng.normal(size=(2, 12, 3))
     a, b = points - points.mean(0), target - target.mean(0)
@@ -145,7 +144,7 @@ def test_procrustes_finds_the_rotation_of_another_library_and_the_best_scale() -
     assert np.allclose(found.numpy(), scale * a @ turn.T + target.mean(0))
 
 
-def test_pose_errors_are_in_the_world_and_aligned_ones_are_not() -> None:
+def test_pose_errors_are_in_the_world_and_aligned_ones_are_not():
     bodies = people(3)
     assert bodies.joints is not None
     shift = torch.tensor([0.03, 0.0, 0.04])
@@ -156,13 +155,11 @@ def test_pose_errors_are_in_the_world_and_aligned_ones_are_not() -> None:
     assert v2v(found) == pytest.approx(0.05, rel=1e-4)
     assert p_pje(found) == pytest.approx(0, abs=1e-5)
     assert p_v2v(found) == pytest.approx(0, abs=1e-5)
-    assert found.joints is not None
     assert found.joints.shape == (3, 22, 3)
 
 
-def test_joints_are_paired_by_name() -> None:
+def test_joints_are_paired_by_name():
     bodies = people(2)
-    assert bodies.joints is not None
     order = torch.randperm(55, generator=torch.Generator().manual_seed(0))
     names = tuple(bodies.joint_names[i] for i in order)
     found = gather_twins(replace(bodies, joints=bodies.joints[:, order], joint_names=names), bodies)
@@ -170,7 +167,7 @@ def test_joints_are_paired_by_name() -> None:
     assert pje(found) == 0
 
 
-def test_points_that_coincide_have_an_aligned_error_and_no_nan() -> None:
+def test_points_that_coincide_have_an_aligned_error_and_no_nan():
     same, spread = torch.zeros(1, 4, 3), torch.eye(4)[None, :, :3]
     value = p_v2v(Twins(same, spread, None, None))
     assert value is not None

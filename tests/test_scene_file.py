@@ -1,5 +1,4 @@
 import json
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -25,7 +24,7 @@ def piece(name: str = "a", file: str = "") -> SceneObject:
     return SceneObject(name, "chair", step(), file, None, "free", place, torch.tensor(0.3), scale)
 
 
-def test_a_mesh_without_a_file_becomes_glb_with_the_same_triangles(tmp_path: Path) -> None:
+def test_a_mesh_without_a_file_becomes_glb_with_the_same_triangles(tmp_path):
     write_scene(Scene(CAMERA, None, (piece(),)), tmp_path / "scene.json")
     assert [p.name for p in (tmp_path / "meshes").iterdir()] == ["a.glb"]
     found = read_scene(tmp_path / "scene.json")
@@ -36,7 +35,7 @@ def test_a_mesh_without_a_file_becomes_glb_with_the_same_triangles(tmp_path: Pat
     assert found.objects[0].mesh.faces.tolist() == tiny.STEP_FACES.tolist()
 
 
-def test_how_far_off_all_sizes_are_together_is_kept_and_by_itself_nothing(tmp_path: Path) -> None:
+def test_how_far_off_all_sizes_are_together_is_kept_and_by_itself_nothing(tmp_path):
     file = tmp_path / "scene.json"
     for spread in (0.0, 0.04):
         write_scene(Scene(CAMERA, None, (piece(),), size_spread=spread), file)
@@ -47,7 +46,7 @@ def test_how_far_off_all_sizes_are_together_is_kept_and_by_itself_nothing(tmp_pa
         read_scene(file)
 
 
-def test_a_users_mesh_is_copied_byte_by_byte(tmp_path: Path) -> None:
+def test_a_users_mesh_is_copied_byte_by_byte(tmp_path):
     source = tmp_path / "user" / "thing.obj"
     source.parent.mkdir()
     tiny.write_obj(source, tiny.STEP, tiny.STEP_FACES)
@@ -57,7 +56,7 @@ def test_a_users_mesh_is_copied_byte_by_byte(tmp_path: Path) -> None:
         assert (out.parent / "meshes" / f"{name}.obj").read_bytes() == source.read_bytes()
 
 
-def test_materials_and_textures_go_with_an_obj_and_two_do_not_mix(tmp_path: Path) -> None:
+def test_materials_and_textures_go_with_an_obj_and_two_do_not_mix(tmp_path):
     pieces = []
     for colour in ("red", "blue"):
         home = tmp_path / colour
@@ -83,7 +82,7 @@ def test_materials_and_textures_go_with_an_obj_and_two_do_not_mix(tmp_path: Path
     assert len(read_scene(tmp_path / "out" / "scene.json").objects) == 2
 
 
-def test_the_buffer_of_a_gltf_goes_with_it(tmp_path: Path) -> None:
+def test_the_buffer_of_a_gltf_goes_with_it(tmp_path):
     import trimesh
 
     body = trimesh.Trimesh(tiny.STEP, tiny.STEP_FACES, process=False)
@@ -97,7 +96,7 @@ def test_the_buffer_of_a_gltf_goes_with_it(tmp_path: Path) -> None:
     assert torch.equal(found.mesh.verts, step().verts)
 
 
-def test_writing_over_the_scene_that_was_read_changes_no_byte(tmp_path: Path) -> None:
+def test_writing_over_the_scene_that_was_read_changes_no_byte(tmp_path):
     folder = tiny.write_capture(tmp_path / "tiny")
     scene = read_scene(folder / "scene.json", CAMERA)
     write_scene(scene, folder / "scene.json")
@@ -106,7 +105,7 @@ def test_writing_over_the_scene_that_was_read_changes_no_byte(tmp_path: Path) ->
     assert before == {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
-def test_vertices_that_no_face_uses_and_faces_without_area_do_not_count(tmp_path: Path) -> None:
+def test_vertices_that_no_face_uses_and_faces_without_area_do_not_count(tmp_path):
     verts = [[9.0, 9, 9], *tiny.STEP.tolist(), [-9.0, 0, 0]]
     lines = ["v " + " ".join(map(str, v)) for v in verts]
     lines += ["f " + " ".join(str(i + 2) for i in f) for f in tiny.STEP_FACES.tolist()]
@@ -117,7 +116,7 @@ def test_vertices_that_no_face_uses_and_faces_without_area_do_not_count(tmp_path
     assert torch.equal(mesh.faces, step().faces)
 
 
-def test_a_scene_without_any_camera_is_refused(tmp_path: Path) -> None:
+def test_a_scene_without_any_camera_is_refused(tmp_path):
     folder = tiny.write_capture(tmp_path / "tiny")
     with pytest.raises(
         InputError, match=r"scene.json: field 'camera' has nothing, expected a camera"
@@ -125,14 +124,14 @@ def test_a_scene_without_any_camera_is_refused(tmp_path: Path) -> None:
         read_scene(folder / "scene.json")
 
 
-def test_numbers_are_written_as_short_decimals_that_read_back_the_same(tmp_path: Path) -> None:
+def test_numbers_are_written_as_short_decimals_that_read_back_the_same(tmp_path):
     write_scene(Scene(CAMERA, None, (piece(),)), tmp_path / "scene.json")
     tree = json.loads((tmp_path / "scene.json").read_text())
     assert tree["objects"][0]["translation"] == [0.1, -1.0, -2.0]
     assert tree["objects"][0]["yaw"] == 0.3
 
 
-def test_a_mesh_whose_remarks_are_latin_1_is_read(tmp_path: Path):
+def test_a_mesh_whose_remarks_are_latin_1_is_read(tmp_path):
     """Trimesh decodes what is not UTF-8 by a library that it does not itself depend on."""
     pytest.importorskip("charset_normalizer", reason="the environment is older than pyproject.toml")
     text = "# Stühle für die Küche\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"

@@ -321,17 +321,14 @@ def test_without_the_folder_the_message_says_what_to_set(monkeypatch, tmp_path):
         load_model("smplx", "female")
 
 
-@pytest.mark.parametrize(
-    ("path", "name", "gender"),
-    [
-        ("smplx/SMPLX_NEUTRAL.npz", "smplx", "neutral"),
-        ("SMPLX_FEMALE.pkl", "smplx", "female"),
-        ("models/smplh/SMPLH_MALE.pkl", "smplh", "male"),
-        ("smplh/male/model.npz", "smplh", "male"),
-        ("smpl/basicModel_f_lbs_10_207_0_v1.0.0.pkl", "smpl", "female"),
-        ("basicmodel_m_lbs_10_207_0_v1.1.0.pkl", "smpl", "male"),
-    ],
-)
+@pytest.mark.parametrize(("path", "name", "gender"), [
+    ("smplx/SMPLX_NEUTRAL.npz", "smplx", "neutral"),
+    ("SMPLX_FEMALE.pkl", "smplx", "female"),
+    ("models/smplh/SMPLH_MALE.pkl", "smplh", "male"),
+    ("smplh/male/model.npz", "smplh", "male"),
+    ("smpl/basicModel_f_lbs_10_207_0_v1.0.0.pkl", "smpl", "female"),
+    ("basicmodel_m_lbs_10_207_0_v1.1.0.pkl", "smpl", "male"),
+])  # fmt: skip
 def test_files_are_found_in_all_usual_places(tmp_path, path, name, gender):
     (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / path).touch()

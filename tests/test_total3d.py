@@ -80,7 +80,7 @@ def write(folder: Path) -> Path:
     return folder
 
 
-def test_a_vertex_lands_on_the_pixel_that_total3d_says(tmp_path: Path) -> None:
+def test_a_vertex_lands_on_the_pixel_that_total3d_says(tmp_path):
     found = read("total3d", write(tmp_path / "room"))
     assert [p.id for p in found.scene.objects] == ["chair_0", "television_2"]
     assert [p.support for p in found.scene.objects] == ["ground", "free"]
@@ -98,7 +98,7 @@ def test_a_vertex_lands_on_the_pixel_that_total3d_says(tmp_path: Path) -> None:
         assert place_object(piece).faces.tolist() == tiny.STEP_FACES.tolist()
 
 
-def test_the_camera_keeps_its_pitch_and_roll(tmp_path: Path) -> None:
+def test_the_camera_keeps_its_pitch_and_roll(tmp_path):
     camera = read("total3d", write(tmp_path / "room")).scene.camera
     pitch, roll = pitch_roll(camera.R_cam_world)
     assert (float(pitch), float(roll)) == pytest.approx((PITCH, ROLL), abs=1e-6)
@@ -123,9 +123,7 @@ BROKEN: list[tuple[str, bytes | None, str]] = [
 
 
 @pytest.mark.parametrize(("file", "content", "words"), BROKEN)
-def test_a_broken_or_missing_file_is_named(
-    tmp_path: Path, file: str, content: bytes | None, words: str
-) -> None:
+def test_a_broken_or_missing_file_is_named(tmp_path, file, content, words):
     folder = write(tmp_path / "room")
     if content is None:
         (folder / file).unlink()
@@ -138,7 +136,7 @@ def test_a_broken_or_missing_file_is_named(
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the shared data is not here")
 class TestRealOutput:
-    def test_its_meshes_lie_on_their_detections_as_loosely_as_known(self) -> None:
+    def test_its_meshes_lie_on_their_detections_as_loosely_as_known(self):
         found = read("total3d", DATA)
         camera, ious = found.scene.camera, []
         assert [p.annotation for p in found.scene.objects] == list(range(18))
@@ -156,14 +154,12 @@ class TestRealOutput:
         assert max(ious[:8]) == pytest.approx(0.90, abs=0.01)
         assert sum(ious) / len(ious) > 0.6
 
-    def test_its_camera_looks_down_by_what_is_known(self) -> None:
+    def test_its_camera_looks_down_by_what_is_known(self):
         pitch, roll = pitch_roll(read("total3d", DATA).scene.camera.R_cam_world)
         assert math.degrees(pitch) == pytest.approx(-16.75, abs=0.01)
         assert math.degrees(roll) == pytest.approx(2.76, abs=0.01)
 
-    def test_it_survives_as_a_capture_folder_with_its_meshes_untouched(
-        self, tmp_path: Path
-    ) -> None:
+    def test_it_survives_as_a_capture_folder_with_its_meshes_untouched(self, tmp_path):
         first = read("total3d", DATA)
         write_capture(first, tmp_path)
         second = read_capture(tmp_path)
@@ -175,7 +171,7 @@ class TestRealOutput:
 
 
 @pytest.mark.parametrize(("at", "byte"), [(144, 7), (320, 0), (321, 255)])
-def test_a_file_that_kills_its_reader_is_refused(tmp_path: Path, at: int, byte: int) -> None:
+def test_a_file_that_kills_its_reader_is_refused(tmp_path, at, byte):
     path = write(tmp_path / "room") / "output" / "bdb_3d.mat"
     content = bytearray(path.read_bytes())
     assert content[at] != byte

@@ -4,7 +4,6 @@ import functools
 import json
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import little_room
 import numpy as np
@@ -68,7 +67,7 @@ CASES = {  # numbers of bodies and masks: what the bodies' numbers and the masks
 
 @pytest.mark.parametrize("shown", [1.0, 0.5])
 @pytest.mark.parametrize("case", CASES)
-def test_tracks_of_two_tools_are_paired_by_position(case: str, shown: float):
+def test_tracks_of_two_tools_are_paired_by_position(case, shown):
     ours, theirs, of_bodies, of_masks = CASES[case]
     bodies, people = bodies_of_rows(walkers(*ours)), masks_of(walkers(*theirs), shown)
     pairs = pair_tracks(bodies, people, CAMERA)
@@ -98,7 +97,7 @@ HEIGHTS = {  # bodies' and masks' numbers of two people; heights by the old and 
 
 
 @pytest.mark.parametrize("case", HEIGHTS)
-def test_heights_in_a_written_capture_follow_the_new_numbers(case: str, tmp_path: Path):
+def test_heights_in_a_written_capture_follow_the_new_numbers(case, tmp_path):
     ours, theirs, given, wanted = HEIGHTS[case]
     rows = [row for row in walkers(*ours, *[99][: 2 - len(ours)]) if row[1] != 99]
     people = replace(masks_of(walkers(*theirs)), heights=given)
@@ -107,7 +106,6 @@ def test_heights_in_a_written_capture_follow_the_new_numbers(case: str, tmp_path
         "room", scene, None, (), None, None, bodies_of_rows(rows), people, None, (),
     ), tmp_path)  # fmt: skip
     capture = read_capture(tmp_path)
-    assert capture.people is not None
     assert capture.people.heights == wanted
     import_into(tmp_path, Parts("", bodies=At(bodies_to_arrays(bodies_of_rows(rows)), "b.npz")))
     info = json.loads((tmp_path / "people.json").read_text())["info"]
@@ -185,7 +183,7 @@ APART = {
 
 
 @pytest.mark.parametrize("case", APART)
-def test_what_may_be_another_person_is_named_and_not_joined(case: str):
+def test_what_may_be_another_person_is_named_and_not_joined(case):
     (frame, person, place), shapes, words = APART[case]
     betas = torch.zeros(len(frame), 10)
     for track, size in (shapes or {}).items():
@@ -223,7 +221,7 @@ SECOND = {  # tracks by where people stand, after a person at -1 with track 0; w
 
 
 @pytest.mark.parametrize("case", SECOND)
-def test_a_second_file_adds_people_and_says_so(case: str):
+def test_a_second_file_adds_people_and_says_so(case):
     files, tracks, words = SECOND[case]
     found, notes = merged(standing(-1), *files)
     middle = found.verts.mean(1)[:, 0]

@@ -35,7 +35,7 @@ def room() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def kept(tmp_path_factory):
     """The convex pieces of the room, cut once, along the axes only (CoACD takes seconds)."""
     folder = tmp_path_factory.mktemp("kept")
     with pytest.MonkeyPatch.context() as patch:
@@ -45,7 +45,7 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def out(kept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def out(kept, tmp_path, monkeypatch):
     monkeypatch.setattr(mover.io.export.solids, "find_spec", lambda _: None)
     shutil.copytree(kept / "stages", tmp_path / "out" / "stages")
     return tmp_path / "out"
@@ -69,13 +69,13 @@ def complaints(stage: Any) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("up", ["y", "z"])
-def test_the_validators_of_usd_find_nothing(out: Path, up: str):
+def test_the_validators_of_usd_find_nothing(out, up):
     stage, _ = stage_of(out, two_people(), up=up)
     assert complaints(stage) == []
 
 
 @pytest.mark.slow
-def test_the_validators_would_find_a_body_that_has_no_place(out: Path):
+def test_the_validators_would_find_a_body_that_has_no_place(out):
     from pxr import UsdPhysics
 
     stage, _ = stage_of(out)
@@ -95,7 +95,7 @@ def parsed(stage: Any) -> dict[Any, dict[str, Any]]:
 
 
 @pytest.mark.parametrize("up", ["y", "z"])
-def test_a_simulator_reads_bodies_pieces_masses_and_a_floor(out: Path, up: str):
+def test_a_simulator_reads_bodies_pieces_masses_and_a_floor(out, up):
     from pxr import UsdGeom, UsdPhysics
 
     stage, home = stage_of(out, up=up)
@@ -119,7 +119,7 @@ def test_a_simulator_reads_bodies_pieces_masses_and_a_floor(out: Path, up: str):
 
 
 @pytest.mark.parametrize("up", ["y", "z"])
-def test_pieces_and_looks_fill_the_same_place_and_the_floor_is_below(out: Path, up: str):
+def test_pieces_and_looks_fill_the_same_place_and_the_floor_is_below(out, up):
     from pxr import UsdGeom
 
     stage, home = stage_of(out, up=up)
@@ -152,7 +152,7 @@ def points_of(stage: Any, path: str) -> np.ndarray:
     return np.concatenate(every)
 
 
-def test_mass_centre_and_moments_are_those_of_the_solid(out: Path):
+def test_mass_centre_and_moments_are_those_of_the_solid(out):
     from pxr import Gf, UsdPhysics
 
     stage, home = stage_of(out)
@@ -172,7 +172,7 @@ def test_mass_centre_and_moments_are_those_of_the_solid(out: Path):
 
 
 @pytest.mark.parametrize("up", ["y", "z"])
-def test_people_are_where_they_were_in_every_frame(out: Path, up: str):
+def test_people_are_where_they_were_in_every_frame(out, up):
     from pxr import UsdGeom
 
     bodies = two_people(6)
@@ -194,7 +194,7 @@ def test_people_are_where_they_were_in_every_frame(out: Path, up: str):
     assert stage.GetEndTimeCode() == float(bodies.frame.max())
 
 
-def test_the_camera_sees_the_same_pixels(out: Path):
+def test_the_camera_sees_the_same_pixels(out):
     from pxr import UsdGeom
 
     stage, home = stage_of(out)
@@ -208,7 +208,7 @@ def test_the_camera_sees_the_same_pixels(out: Path):
     assert [u, v] == pytest.approx(seen[:2] / seen[2], abs=0.01)
 
 
-def test_ids_that_the_file_keeps_for_itself_stay_apart(out: Path):
+def test_ids_that_the_file_keeps_for_itself_stay_apart(out):
     scene = room()
     names = ("ground", "physics", "wood")
     pieces = [dataclasses.replace(p, id=n) for p, n in zip(scene.objects, names, strict=True)]
@@ -218,7 +218,7 @@ def test_ids_that_the_file_keeps_for_itself_stay_apart(out: Path):
     assert set(names) <= set(ids)
 
 
-def test_an_object_that_is_moved_stands_still_until_it_stands_elsewhere(out: Path):
+def test_an_object_that_is_moved_stands_still_until_it_stands_elsewhere(out):
     scene = room()
     chair, *others = scene.objects
     later = Segment(12, chair.t_world_object + torch.tensor([0.0, 0.0, 1.0]), chair.yaw + 1)
