@@ -8,15 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from raster_torch_contour import blend, cuts, outline
 from raster_torch_depth import planes, surface
-from raster_torch_spans import (
-    LOW,
-    coverage,
-    inverse_depth,
-    on_screen,
-    signed_areas,
-    spans,
-    zbuffer,
-)
+from raster_torch_spans import LOW, coverage, inverse_depth, on_screen, signed_areas, spans, zbuffer
 from torch import Tensor
 
 from mover.geometry.raster.records import Crops, Depths, Layers, Topology

@@ -118,10 +118,7 @@ def test_a_ray_cluster_loses_a_node_and_no_capture(tmp_path: Path):
         [f"--address={address}", "--node-ip-address=127.0.0.1"],
     ]
     status = [sys.executable, "-m", "ray.scripts.scripts", "status", f"--address={address}"]
-    with (
-        running(*start, *nodes[0], log=tmp_path / "first.log", env=env),
-        ExitStack() as stack,
-    ):
+    with running(*start, *nodes[0], log=tmp_path / "first.log", env=env), ExitStack() as stack:
         wait_for(lambda: said(*status, env=env).count(" node_") == 1)
         second = stack.enter_context(
             running(*start, *nodes[1], log=tmp_path / "second.log", env=env)

@@ -8,15 +8,7 @@ import pytest
 import torch
 from jaxtyping import Bool
 from scipy.spatial.transform import Rotation
-from test_find_depth import (
-    QUICK,
-    SIZE,
-    K,
-    film,
-    masks_of,
-    moved,
-    spots,
-)
+from test_find_depth import QUICK, SIZE, K, film, masks_of, moved, spots
 from test_find_depth import inputs_of as depth_inputs
 from torch import Tensor
 

@@ -15,13 +15,7 @@ from mover.energy.human_terms import BodyView, DepthMaps, bounds_of, merge
 from mover.geometry import volume_warp
 from mover.geometry.raster import Crops
 from mover.geometry.raster import layers as layers_warp
-from mover.geometry.volume import (
-    Volume,
-    grid_around,
-    sample,
-    sample_torch,
-    signed_distance,
-)
+from mover.geometry.volume import Volume, grid_around, sample, sample_torch, signed_distance
 from mover.stages.config import GatherConfig
 from mover.stages.contacts.gather_cues import GatherInputs, depth_bounds
 from mover.stages.masks import mask_table

@@ -75,9 +75,7 @@ def test_a_place_metres_away_costs_more_than_one_beside_it_but_not_without_bound
 def test_a_given_yaw_may_be_off_by_a_quarter_or_half_turn_rather_than_by_an_eighth() -> None:
     given = replace(given_at(somewhere()), along=torch.zeros(1), weight=torch.ones(1))
     layouts = Layout(
-        somewhere().t_world_object.expand(721, 1, 3),
-        TURNS[:, None],
-        torch.zeros(721, 1, 3),
+        somewhere().t_world_object.expand(721, 1, 3), TURNS[:, None], torch.zeros(721, 1, 3)
     )
     costs = given_term(layouts, given)[:, 0]
     eighth, quarter, half = (costs[360 + 2 * degrees] for degrees in (45, 90, 180))

@@ -11,14 +11,7 @@ from test_readers_people import Toy
 from tiny_capture import write_capture
 
 from mover.bodies import BODY_MODELS
-from mover.bodies.posa import (
-    canonical,
-    decode,
-    load_posa,
-    neighbours,
-    posa_contacts,
-    spirals,
-)
+from mover.bodies.posa import canonical, decode, load_posa, neighbours, posa_contacts, spirals
 from mover.core.errors import InputError
 from mover.core.types import Bodies, BodyPose
 from mover.geometry.rotations import axis_angle, rot_y
