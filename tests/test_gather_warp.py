@@ -98,21 +98,13 @@ def assert_same_layers(verts: Tensor, faces: Tensor, views: Crops) -> None:
         torch.testing.assert_close(mine, other, rtol=0, atol=1e-5)
 
 
-def test_rays_enter_and_leave_bodies_where_the_torch_version_says() -> None:
-    verts, faces = posed_bodies(3)
-    turned = verts * torch.tensor([1.0, -1.0, -1.0]) + torch.tensor([0.1, 0.2, 3.0])
-    views = cameras(3, (120, 160), 150.0)
-    assert layers_warp(turned, faces, views).front.isfinite().any((-2, -1)).all()
-    assert_same_layers(turned, faces, views)
-    assert_same_layers(turned, faces.int(), views)
-
-
 def test_what_is_behind_the_camera_or_beside_the_image_is_not_drawn() -> None:
     verts, faces = posed_bodies(4)
     shift = torch.tensor([[0.0, 0.2, 0.3], [0.0, 0, -4.0], [9.0, 0, 3.0], [0.5, 0.8, 2.0]])
     turned = verts * torch.tensor([1.0, -1.0, -1.0]) + shift[:, None]
     views = cameras(4, (90, 120), 110.0)
     assert_same_layers(turned, faces, views)
+    assert_same_layers(turned, faces.int(), views)
     found = layers_warp(turned, faces, views)
     assert not found.front[1:3].isfinite().any()
     assert (turned[0, :, 2] < 0).any()  # a part of it is behind the camera
@@ -226,7 +218,7 @@ def test_triangles_without_an_area_change_nothing() -> None:
     assert torch.equal(found, assert_same(verts, faces, grid))
 
 
-@pytest.mark.parametrize("level", [0, 1, 2, 4, 5])
+@pytest.mark.parametrize("level", [0, 2, 4])
 def test_meshes_of_any_size_have_the_distances_of_libigl(level: int) -> None:
     verts, faces = sphere([0.1, -0.2, 0.3], 0.5, level)
     verts = torch.stack([verts, verts * torch.tensor([1.1, 0.8, 1.0])])

@@ -112,23 +112,7 @@ class TestRepetition:
 
 
 class TestBadInput:
-    """What `test_raster` asks of every engine is not repeated here."""
-
-    @pytest.mark.parametrize(
-        ("factor", "shift"),
-        [(1, (0, 0, -3)), (1, (80, 0, 0)), (1e4, (0, 0, 0)), (1e12, (0, 0, 0)), (1e-9, (0, 0, 0))],
-    )
-    def test_objects_out_of_sight_draw_nothing_that_is_not_finite(self, factor, shift):
-        verts, shape = packed(["chair"])
-        verts = verts * factor + torch.tensor([0, 0, 3.0]) + torch.tensor(shape and shift)
-        views = Crops(PINHOLE[None], 32, 32)
-        found, truth = (pulled(r, verts, shape, views) for r in (raster_warp, raster_torch))
-        for values, expected in zip(found[:4], truth[:4], strict=True):
-            torch.testing.assert_close(values, expected, atol=1e-5, rtol=1e-5)
-        assert torch.isfinite(found[4]).all()
-        verts[0, 0] = torch.nan
-        for values in pulled(raster_warp, verts, shape, views)[:3]:
-            assert torch.isfinite(values).all()
+    """Beside that of `test_raster.degenerate`."""
 
     def test_a_window_of_4k_is_drawn(self):
         verts_cam, shape, views = scene(["chair"], 2160)
