@@ -16,13 +16,7 @@ from torch import Tensor
 
 from mover.bodies.skeleton import BODY
 from mover.bodies.skin import LANDMARKS, PARTS, landmark_rings, lowest_soles, model_parts
-from mover.bodies.skinning import (
-    ASSETS,
-    SkinnedBody,
-    open_body,
-    vertex_subset,
-    zero_pose,
-)
+from mover.bodies.skinning import ASSETS, SkinnedBody, open_body, vertex_subset, zero_pose
 from mover.bodies.smpl_files import KINDS, load_smpl
 from mover.bodies.transfer import solved
 from mover.core.errors import InputError

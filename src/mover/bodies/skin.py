@@ -55,9 +55,7 @@ HEIGHT = 0.03
 
 
 def lowest_soles(
-    meshes: Float[Tensor, "meshes verts 3"],
-    faces: Int[Tensor, "faces 3"],
-    up: Float[Tensor, "3"],
+    meshes: Float[Tensor, "meshes verts 3"], faces: Int[Tensor, "faces 3"], up: Float[Tensor, "3"]
 ) -> Int[Tensor, " verts"]:
     """Index into `PARTS` (a sole) or -1 of each vertex; sides by position only."""
     height = meshes @ up

@@ -102,11 +102,7 @@ def gather_truth(
 
 
 def gather_touch(
-    bodies: Bodies,
-    furniture: Furniture,
-    truth: TrueTouch | None,
-    count: int,
-    reach: float,
+    bodies: Bodies, furniture: Furniture, truth: TrueTouch | None, count: int, reach: float
 ) -> Touch:
     """Bodies beside the furniture of their scene: `count` of them, and those the truth knows.
 

@@ -241,10 +241,7 @@ def table(metrics: Mapping[str, Any], shown: Sequence[str] | None = None) -> str
 
 
 def evaluate_people(
-    bodies: Bodies,
-    floor: float | None,
-    furniture: Furniture,
-    truth: Bodies | None = None,
+    bodies: Bodies, floor: float | None, furniture: Furniture, truth: Bodies | None = None
 ) -> dict[str, float]:
     """How people fit floor and furniture, and how far they are from the truth.
 

@@ -123,7 +123,7 @@ HARM_METRICS: dict[str, Metric[float]] = {
         "share",
         0.0,
         lambda farther: float(farther > 0.1),
-    ),
+    )
 }
 """Of how much farther from the truth an object's centre is than initially [m]; the mean is the
 share of objects that were made worse."""

@@ -15,12 +15,7 @@ from torch import Tensor
 
 from mover.bodies.keypoints import LAYOUTS, spots_of
 from mover.bodies.skeleton import BODY
-from mover.bodies.skinning import (
-    SkinnedBody,
-    pose_joints,
-    vertex_subset,
-    widths_of,
-)
+from mover.bodies.skinning import SkinnedBody, pose_joints, vertex_subset, widths_of
 from mover.core.observe import Energy
 from mover.core.records import record, rows_of
 from mover.fitting.priors import kind_of, spreads

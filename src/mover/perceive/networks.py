@@ -29,10 +29,7 @@ from mover.perceive.needs import absent, install
 from mover.perceive.video import Clip, read_picture
 
 log = logging.getLogger(__name__)
-CLASSES = {
-    "masks": "AutoModelForUniversalSegmentation",
-    "keypoints": "VitPoseForPoseEstimation",
-}
+CLASSES = {"masks": "AutoModelForUniversalSegmentation", "keypoints": "VitPoseForPoseEstimation"}
 """Classes of transformers for each task."""
 PERSON = "person"
 LEAST = 0.0004  # smallest instance, as a share of the picture

@@ -4,15 +4,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from mover.core.settings import (
-    Count,
-    Metres,
-    Share,
-    Sigma,
-    Weight,
-    float_in,
-    int_in,
-)
+from mover.core.settings import Count, Metres, Share, Sigma, Weight, float_in, int_in
 from mover.energy.config import (
     GROWTH,
     REFINE,

@@ -21,14 +21,7 @@ from torch import Tensor
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
 from mover.core.types import Camera
-from mover.energy.human_terms import (
-    TILT_TAIL,
-    FootContacts,
-    feet_term,
-    heights,
-    tilt_prior,
-    up_cam,
-)
+from mover.energy.human_terms import TILT_TAIL, FootContacts, feet_term, heights, tilt_prior, up_cam
 from mover.geometry.camera import pitch_roll, tilted, to_world
 from mover.stages.camera.foot_votes import PLACE_NOISE, STEP_NOISE, Votes, vote
 from mover.stages.config import AlignConfig

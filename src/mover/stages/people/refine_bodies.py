@@ -254,10 +254,7 @@ class RefinedBodies:
 
 
 def refine_bodies(
-    room: Room,
-    capture: Capture | None,
-    config: RefineBodiesConfig,
-    observe: Observer = silent,
+    room: Room, capture: Capture | None, config: RefineBodiesConfig, observe: Observer = silent
 ) -> RefinedBodies:
     """Move the people of a room so that they agree with its floor and furniture.
 
