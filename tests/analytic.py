@@ -1,5 +1,6 @@
 """A noiseless room of boxes whose evidence is known in closed form."""
 
+import functools
 from dataclasses import replace
 
 import torch
@@ -38,14 +39,7 @@ def box_verts(size):
 def grid_on_top(size, n=6):
     u = torch.linspace(-0.45, 0.45, n, dtype=torch.float64)
     x, z = torch.meshgrid(u, u, indexing="ij")
-    return torch.stack(
-        [
-            x.flatten() * size[0],
-            torch.full((n * n,), size[1], dtype=torch.float64),
-            z.flatten() * size[2],
-        ],
-        -1,
-    )
+    return torch.stack([x * size[0], torch.full_like(x, size[1]), z * size[2]], -1).flatten(0, 1)
 
 
 def boxes_of(categories, sizes, dtype=torch.float32):
@@ -65,6 +59,7 @@ def boxes_of(categories, sizes, dtype=torch.float32):
     )  # fmt: skip
 
 
+@functools.cache
 def make_inputs(dtype=torch.float32, size=96):
     """Everything that `place_objects` needs, at the truth."""
     camera = Camera(
@@ -72,11 +67,8 @@ def make_inputs(dtype=torch.float32, size=96):
         tilted(torch.tensor(-0.2, dtype=dtype), torch.tensor(0.03, dtype=dtype)), 640, 360,
     )  # fmt: skip
     n, objects = len(SIZES), boxes_of(("stool", "table", "cabinet"), SIZES, dtype)
-    truth = Layout(
-        torch.tensor(PLACES, dtype=dtype),
-        torch.tensor(YAWS, dtype=dtype),
-        torch.zeros(n, 3, dtype=dtype),
-    )
+    places, yaws = (torch.tensor(x, dtype=dtype) for x in (PLACES, YAWS))
+    truth = Layout(places, yaws, torch.zeros(n, 3, dtype=dtype))
     image = image_at(objects, truth, camera, size)
     return PlaceInputs(
         objects, camera, GROUND, image, humans_at(objects, truth, camera, image),
@@ -137,14 +129,9 @@ def humans_at(objects, layout, camera, image):
     weight[:, 0] = 1.0
     heading = torch.stack([layout.yaw[:2].sin(), layout.yaw[:2].cos()], -1)
     touches = ContactPoints(
-        torch.tensor([0, 1]),
-        points.contiguous(),
-        weight,
-        torch.tensor([6.0, 6.0]).to(near),
-        shares_of(weight),
-        heading,
-        torch.tensor([False, False]),
-    )
+        torch.tensor([0, 1]), points.contiguous(), weight, torch.tensor([6.0, 6.0]).to(near),
+        shares_of(weight), heading, torch.tensor([False, False]),
+    )  # fmt: skip
     return HumanCues(DepthRange(near, far, area), BodySpace(volume), touches)
 
 

@@ -3,6 +3,7 @@
 Kernels draw in single precision, the reference in double; test_raster_warp.py compares them.
 """
 
+import functools
 import math
 
 import numpy as np
@@ -16,6 +17,7 @@ from raycast import cast, cast_backs
 from mover.geometry.camera import NEAR, tilted
 from mover.geometry.raster import Crops, Topology, depths, first_hit, layers, look, silhouettes
 from mover.geometry.rotations import rot_y
+from mover.geometry.topology import edges_of
 
 FOCAL = 500.0
 
@@ -51,24 +53,18 @@ SHAPES = {
 }
 
 
-def edges_of(faces):
-    beside = {}
-    for f, (a, b, c) in enumerate(faces.tolist()):
-        for i, j in ((a, b), (b, c), (c, a)):
-            beside.setdefault((min(i, j), max(i, j)), []).append(f)
-    return torch.tensor([[*e, *f] for e, f in beside.items()]).view(-1, 4)
-
-
-def topology(faces):
-    return Topology(faces[None], edges_of(faces)[None])
+@functools.cache
+def made(name):
+    """Vertices, triangles and edges."""
+    mesh = SHAPES[name]()
+    faces = torch.tensor(np.array(mesh.faces))
+    return torch.tensor(np.array(mesh.vertices)), faces, edges_of(faces)
 
 
 def packed(names, extra=0, dtype=torch.float32):
     """Vertices and topology of shapes, padded to the largest and by `extra` more."""
-    meshes = [SHAPES[n]() for n in names]
-    faces = [torch.tensor(np.array(m.faces)) for m in meshes]
-    edges = [edges_of(f) for f in faces]
-    verts = [torch.tensor(np.array(m.vertices), dtype=dtype) for m in meshes]
+    verts, faces, edges = zip(*map(made, names), strict=True)
+    verts = [v.to(dtype) for v in verts]
 
     def pad(parts, fill):
         size = max(map(len, parts)) + extra
@@ -123,7 +119,8 @@ def slab(low, high, near, far, K, dtype=torch.float64):
     y = [(v - K[1, 2]) / K[1, 1] * near for v in (low[1], high[1])]
     mesh = trimesh.creation.box(bounds=[[x[0], y[0], near], [x[1], y[1], far]])
     faces = torch.tensor(np.array(mesh.faces))
-    return torch.tensor(np.array(mesh.vertices), dtype=dtype), topology(faces)
+    verts = torch.tensor(np.array(mesh.vertices), dtype=dtype)
+    return verts, Topology(faces[None], edges_of(faces)[None])
 
 
 def differentiable(fn, verts_cam):
