@@ -4,12 +4,14 @@ from collections.abc import Callable
 from functools import partial
 from typing import Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from mover.bodies.skinning import open_body
 from mover.bodies.smpl_files import load_smpl
 from mover.core.errors import InputError
+from mover.core.records import rows_of
 from mover.core.types import BodyPose
 
 
@@ -37,6 +39,15 @@ class BodyModel(Protocol):
     ) -> tuple[Float[Tensor, "bodies verts 3"], Float[Tensor, "bodies joints 3"]]:
         """Vertices and joints [m], differentiable in all of `pose`."""
         ...
+
+
+def run_model(
+    model: BodyModel, pose: BodyPose, rows: int = 128
+) -> tuple[Float[Tensor, "bodies verts 3"], Float[Tensor, "bodies joints 3"]]:
+    """Vertices and joints, some rows at a time to bound the memory [m]."""
+    with torch.no_grad():
+        parts = [model.posed(rows_of(pose, r)) for r in torch.arange(len(pose.transl)).split(rows)]
+    return torch.cat([verts for verts, _ in parts]), torch.cat([joints for _, joints in parts])
 
 
 BODY_MODELS: dict[str, Callable[[str], BodyModel]] = {

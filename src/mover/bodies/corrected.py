@@ -1,17 +1,18 @@
 """Bodies that are moved: into the world, as a whole about the pelvis, by a model joint by joint."""
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mover.bodies import BodyModel, load_model
+from mover.bodies import BodyModel, load_model, run_model
 from mover.bodies.skeleton import BODY
 from mover.bodies.skinning import SkinnedBody, growth_of, shaped, vertex_subset
 from mover.core.errors import InputError
-from mover.core.records import map_tensors, record, rows_of
+from mover.core.records import map_tensors, record
 from mover.core.types import Bodies, BodyPose, Camera
 from mover.geometry.camera import to_world
 from mover.geometry.mesh import vertex_normals
@@ -89,10 +90,10 @@ def _loose_points(bodies: Bodies) -> Float[Tensor, "bodies points 3"]:
     return torch.cat([bodies.verts.mean(1, keepdim=True), bodies.verts[:, some]], 1)
 
 
-def no_correction(puppet: Puppet) -> Correction:
+def no_correction(of: Puppet | Bodies) -> Correction:
     """Leave all bodies where they are."""
-    zero = torch.zeros_like(puppet.points[:, 0])
-    width = 0 if puppet.pose is None else puppet.pose.body_pose.shape[-1]
+    zero = torch.zeros_like((of.points if isinstance(of, Puppet) else of.verts)[:, 0])
+    width = 0 if of.pose is None else of.pose.body_pose.shape[-1]
     return Correction(zero, zero, zero.new_zeros(len(zero), width))
 
 
@@ -103,10 +104,14 @@ def moved(puppet: Puppet, by: Correction) -> MovedSkin:
         bent = dataclasses.replace(puppet.pose, body_pose=puppet.pose.body_pose + by.angles)
         skin, joints = puppet.model.posed(bent)
         points = joints[:, puppet.joints]
-    pivot = puppet.points[:, :1]
-    turn = axis_angle(by.turn).mT
-    goal = pivot + by.shift[:, None]
-    return MovedSkin((skin - pivot) @ turn + goal, (points - pivot) @ turn + goal)
+    carry = _rigidly(puppet.points[:, :1], by)
+    return MovedSkin(carry(skin), carry(points))
+
+
+def _rigidly(pivot: Float[Tensor, "bodies 1 3"], by: Correction) -> Callable[[Tensor], Tensor]:
+    """Moves points of bodies as a whole about a pivot."""
+    turn, goal = axis_angle(by.turn).mT, pivot + by.shift[:, None]
+    return lambda points: (points - pivot) @ turn + goal
 
 
 def normals_after(puppet: Puppet, by: Correction) -> Float[Tensor, "bodies picked 3"]:
@@ -116,17 +121,21 @@ def normals_after(puppet: Puppet, by: Correction) -> Float[Tensor, "bodies picke
 
 def corrected(bodies: Bodies, by: Correction) -> Bodies:
     """Bodies of the world after a correction (a row for each); parameters are posed again."""
-    if bodies.pose is None:
-        return _moved_rigidly(bodies, by)
-    pose = _new_pose(bodies.pose, by)
+    pose = bodies.pose
+    if pose is None:
+        carry = _rigidly(_loose_points(bodies)[:, :1], by)
+        joints = None if bodies.joints is None else carry(bodies.joints)
+        return dataclasses.replace(bodies, verts=carry(bodies.verts), joints=joints)
+    turned = axis_angle(by.turn.double()) @ axis_angle(pose.global_orient.double())  # at the pelvis
+    pose = map_tensors(lambda x: x.detach(), dataclasses.replace(
+        pose, global_orient=rotation_vectors(turned).to(pose.global_orient),
+        transl=pose.transl + by.shift, body_pose=pose.body_pose + by.angles,
+    ))  # fmt: skip
     model = load_model(pose.model, pose.gender)
-    with torch.no_grad():
-        parts = [model.posed(rows_of(pose, r)) for r in torch.arange(len(by.shift)).split(CHUNK)]
-    verts, joints = (torch.cat([part[k] for part in parts]) for k in (0, 1))
+    verts, joints = (x.to(bodies.verts) for x in run_model(model, pose, CHUNK))
     return dataclasses.replace(
-        bodies, verts=verts.to(bodies.verts), joints=joints.to(bodies.verts),
-        joint_names=model.joint_names, pose=pose,
-    )  # fmt: skip
+        bodies, verts=verts, joints=joints, joint_names=model.joint_names, pose=pose
+    )
 
 
 def larger(bodies: Bodies, factor: Float[Tensor, " bodies"]) -> Bodies:
@@ -156,30 +165,8 @@ def larger(bodies: Bodies, factor: Float[Tensor, " bodies"]) -> Bodies:
     grown = betas + wide.log() * growth / growth.square().sum()
     before, after = (shaped(model, some)[1][:, 0].to(pose.transl) for some in (betas, grown))
     pose = dataclasses.replace(pose, betas=grown, transl=wide * (pose.transl + before) - after)
-    none = (torch.zeros_like(x) for x in (pose.transl, pose.transl, pose.body_pose))
-    return corrected(dataclasses.replace(bodies, pose=pose), Correction(*none))
-
-
-def _moved_rigidly(bodies: Bodies, by: Correction) -> Bodies:
-    pivot = _loose_points(bodies)[:, :1]
-    turn, goal = axis_angle(by.turn).mT, pivot + by.shift[:, None]
-
-    def along(places: Tensor) -> Tensor:
-        return (places - pivot) @ turn + goal
-
-    joints = None if bodies.joints is None else along(bodies.joints)
-    return dataclasses.replace(bodies, verts=along(bodies.verts), joints=joints)
-
-
-def _new_pose(pose: BodyPose, by: Correction) -> BodyPose:
-    """The parameters of the moved bodies: the root turns about the pelvis."""
-    turned = axis_angle(by.turn.double()) @ axis_angle(pose.global_orient.double())
-    orient = rotation_vectors(turned)
-    found = dataclasses.replace(
-        pose, global_orient=orient.to(pose.global_orient), transl=pose.transl + by.shift,
-        body_pose=pose.body_pose + by.angles,
-    )  # fmt: skip
-    return map_tensors(lambda x: x.detach(), found)
+    taller = dataclasses.replace(bodies, pose=pose)
+    return corrected(taller, no_correction(taller))
 
 
 def spread(verts: Float[Tensor, "verts 3"], count: int) -> Int[Tensor, " picked"]:

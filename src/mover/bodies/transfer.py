@@ -9,7 +9,7 @@ angles of SMPL, whose 21 joints of the body SMPL-X has, too.
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -141,21 +141,32 @@ def as_smplx(
 
 def solved(
     start: dict[str, Tensor],
-    free: tuple[str, ...],
+    free: Iterable[str],
     energy: Callable[[dict[str, Tensor]], Float[Tensor, ""]],
     steps: int,
+    evaluations: int | None = None,
+    flat: float = 1e-7,
 ) -> dict[str, Tensor]:
-    """Lower the energy in some of the unknowns by L-BFGS with a strong Wolfe line search."""
+    """Lower the energy in some of the unknowns by L-BFGS with a strong Wolfe line search.
+
+    It ends after `evaluations` (None: 1.25 for each step) or where no gradient exceeds `flat`.
+
+    Raises:
+        ValueError: If the energy is not finite at the start.
+    """
     values = {name: start[name].detach().clone().requires_grad_() for name in free}
     solver = torch.optim.LBFGS(
-        list(values.values()), max_iter=steps, history_size=20, line_search_fn="strong_wolfe"
-    )
+        list(values.values()), max_iter=steps, max_eval=evaluations, history_size=20,
+        tolerance_grad=flat, line_search_fn="strong_wolfe",
+    )  # fmt: skip
 
     def closure() -> Tensor:
         solver.zero_grad()
         value = energy(start | values)
-        value.backward()
+        torch.autograd.backward(value)
         return value
 
-    solver.step(closure)
+    first = solver.step(closure)  # pyright: ignore[reportArgumentType]
+    if not bool(torch.as_tensor(first).isfinite()):
+        raise ValueError("the energy of the bodies is not finite")
     return start | {name: value.detach() for name, value in values.items()}

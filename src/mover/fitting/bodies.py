@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mover.bodies import BodyModel
+from mover.bodies import BodyModel, run_model
 from mover.bodies.skinning import FLAT, SkinnedBody, growth_of, shaped, widths_of
 from mover.core.observe import Energy, Observer, Step, silent
 from mover.core.records import record, rows_of
@@ -260,9 +260,6 @@ def _speed(state: FitState, keypoints: Keypoints) -> Float[Tensor, "rows joints"
 # What was solved, as bodies.
 
 
-CHUNK = 128  # rows that are posed at once
-
-
 def pose_of(at: Unknowns, frame: Frame, model: SkinnedBody) -> BodyPose:
     """Parameters of the fitted bodies."""
     angles = frame.prior.decode(at.code)
@@ -295,14 +292,11 @@ def pose_of(at: Unknowns, frame: Frame, model: SkinnedBody) -> BodyPose:
 
 def bodies_of(pose: BodyPose, model: BodyModel, keypoints: Keypoints) -> Bodies:
     """Meshes and joints, in the camera frame."""
-    with torch.no_grad():
-        parts = [
-            model.posed(rows_of(pose, rows)) for rows in torch.arange(len(pose.transl)).split(CHUNK)
-        ]
+    verts, joints = run_model(model, pose)
     return Bodies(
-        verts=torch.cat([verts for verts, _ in parts]),
+        verts=verts,
         faces=model.faces,
-        joints=torch.cat([joints for _, joints in parts]),
+        joints=joints,
         joint_names=model.joint_names,
         frame=keypoints.frame,
         person=keypoints.person,

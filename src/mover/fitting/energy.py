@@ -205,8 +205,12 @@ class FitState:
 
     @property
     def slope(self) -> Float[Tensor, " bodies"]:
-        """Of the floor, in what may be, squared."""
-        cost = ground.level_cost(floor_of(self.at, self.frame), self.seen.floor)
+        """Squared slopes of the floor, and where it is known its height, in what may be."""
+        floor, known = floor_of(self.at, self.frame), self.seen.floor
+        tilt = ground.TILT if known is None else ground.KNOWN_TILT
+        cost = (floor[:2] / floor.new_tensor(tilt)).square().sum()
+        if known is not None:
+            cost = cost + ((floor[2] - known) / ground.KNOWN_HEIGHT).square()
         return cost.expand(len(self.at.place))
 
     @property

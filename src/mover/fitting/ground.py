@@ -19,19 +19,25 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mover.bodies.skeleton import BODY
+from mover.bodies.skeleton import BODY, SIDES
 from mover.bodies.skinning import SkinnedBody
 
 Plane = tuple[Float[Tensor, "3"], Float[Tensor, ""] | float]
 """Away from the floor, in camera axes, and its height along that from the camera [m]."""
 
 SUPPORT = 0.05  # [m], how far a joint may be under the floor
-ROLL, PITCH = math.radians(2), math.radians(8)  # how far a camera of unknown tilt is from level
-KNOWN_TILT, KNOWN_HEIGHT = math.radians(0.3), 0.01  # [rad], [m], the same for a given floor
+TILT = math.radians(2), math.radians(8)  # roll and pitch of a camera of unknown tilt [rad]
+KNOWN_TILT, KNOWN_HEIGHT = (math.radians(0.3),) * 2, 0.01  # [rad], [m], the same for a given floor
 FRAMES = 20  # whose weight on the floor equals that of its prior
-FEET = tuple([BODY.index(f"{side}_{joint}") for side in ("left", "right")]
-             for joint in ("ankle", "foot"))  # fmt: skip
 NECK = BODY.index("neck")
+
+
+def _of_sides(joint: str) -> list[int]:
+    """The left and the right one."""
+    return [BODY.index(f"{side}_{joint}") for side in SIDES]
+
+
+FEET = _of_sides("ankle"), _of_sides("foot")
 LIES = math.sin(math.radians(35))  # largest rise of a lying person's trunk
 SITS = math.sin(math.radians(50))  # smallest rise of a seated or standing person's trunk
 ALONG = 0.7  # cosine of trunk and view from which distance is hardly seen
@@ -66,21 +72,11 @@ def sole_heights(
     return (low - soles.to(low)).amin(-1)
 
 
-def level_cost(floor: Float[Tensor, " floor"], known: float | None) -> Float[Tensor, ""]:
-    """Squared slopes of the floor, and where it is known its height, in what may be."""
-    tilt = (ROLL, PITCH) if known is None else (KNOWN_TILT, KNOWN_TILT)
-    cost = (floor[:2] / floor.new_tensor(tilt)).square().sum()
-    return cost if known is None else cost + ((floor[2] - known) / KNOWN_HEIGHT).square()
-
-
 def center_of_mass(joints: Float[Tensor, "bodies joints 3"]) -> Float[Tensor, "bodies 3"]:
     """Centre of mass by the segments of Winter 2009, Table 4.1 (head, arms, trunk as one) [m]."""
-
-    def middle(name: str) -> Float[Tensor, "bodies 3"]:
-        return joints[:, [BODY.index(f"{side}_{name}") for side in ("left", "right")]].mean(1)
-
-    hip, knee, ankle = middle("hip"), middle("knee"), middle("ankle")
-    upper = hip + 0.626 * (middle("shoulder") - hip)
+    names = ("hip", "knee", "ankle", "shoulder")
+    hip, knee, ankle, shoulder = (joints[:, _of_sides(name)].mean(1) for name in names)
+    upper = hip + 0.626 * (shoulder - hip)
     thigh, shank = hip + 0.433 * (knee - hip), knee + 0.606 * (ankle - knee)
     return 0.678 * upper + 0.2 * thigh + 0.122 * shank
 
@@ -89,10 +85,7 @@ def standing_share(
     joints: Float[Tensor, "bodies joints 3"], up: Float[Tensor, "3"]
 ) -> Float[Tensor, " bodies"]:
     """From 0 to 1, how surely the legs carry a body: long legs below an upright trunk."""
-    hip, knee, ankle = (
-        joints[:, [BODY.index(f"{side}_{name}") for side in ("left", "right")]]
-        for name in ("hip", "knee", "ankle")
-    )
+    hip, knee, ankle = (joints[:, _of_sides(name)] for name in ("hip", "knee", "ankle"))
     length = (hip - knee).norm(dim=-1) + (knee - ankle).norm(dim=-1)
     legs = (((hip - ankle) @ up) / length.clamp_min(1e-3)).amin(1)
     trunk = trunk_of(joints) @ up

@@ -18,10 +18,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mover.bodies.transfer import solved
 from mover.core.errors import InputError
 from mover.core.observe import Energy
 from mover.core.records import record
-from mover.fitting.unknowns import ANGLES, PosePrior, lowered
+from mover.fitting.unknowns import ANGLES, PosePrior
 from mover.geometry.rotations import axis_angle
 
 ENCODING_STEPS = 100
@@ -35,13 +36,13 @@ def encoded(
         return angles
     goal = axis_angle(angles.unflatten(-1, (-1, 3)))
 
-    def energy(values: dict[str, Tensor]) -> Energy:
+    def energy(values: dict[str, Tensor]) -> Float[Tensor, ""]:
         turns = axis_angle(prior.decode(values["code"]).unflatten(-1, (-1, 3)))
         miss = (turns - goal[:, : turns.shape[1]]).square().flatten(1).sum(-1)
-        return Energy({"turns": miss, "size": 3e-4 * values["code"].square().sum(-1)})
+        return Energy({"turns": miss, "size": 3e-4 * values["code"].square().sum(-1)}).total
 
     start = {"code": angles.new_zeros(len(angles), prior.width)}
-    return lowered(energy, start, ENCODING_STEPS)["code"]
+    return solved(start, start, energy, ENCODING_STEPS, 2 * ENCODING_STEPS, 1e-6)["code"]
 
 
 BODY_JOINTS = 21
@@ -141,14 +142,8 @@ def gram_schmidt(columns: Float[Tensor, "*batch 3 2"]) -> Float[Tensor, "*batch 
 
 def vectors_of(turns: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
     """Axis-angle vectors of rotations [rad], with finite gradients everywhere below 180 degrees."""
-    skew = torch.stack(
-        [
-            turns[..., 2, 1] - turns[..., 1, 2],
-            turns[..., 0, 2] - turns[..., 2, 0],
-            turns[..., 1, 0] - turns[..., 0, 1],
-        ],
-        -1,
-    )
+    ends = ((2, 1), (0, 2), (1, 0))
+    skew = torch.stack([turns[..., i, j] - turns[..., j, i] for i, j in ends], -1)
     cosine = ((turns.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1)
     sine = (skew.square().sum(-1) / 4 + 1e-12).sqrt()
     angle = torch.atan2(sine, cosine)

@@ -16,6 +16,7 @@ from torch import Tensor
 from mover.bodies.keypoints import LAYOUTS, spots_of
 from mover.bodies.skeleton import BODY
 from mover.bodies.skinning import SkinnedBody, pose_joints, vertex_subset, widths_of
+from mover.bodies.transfer import solved
 from mover.core.observe import Energy
 from mover.core.records import record, rows_of
 from mover.fitting.priors import kind_of, spreads
@@ -269,30 +270,4 @@ def solve(
         return dataclasses.replace(start, **{n: v * scale[n] for n, v in values.items()})
 
     values = {name: (getattr(start, name) / scale[name]).detach() for name in scale}
-    return real(lowered(lambda v: energy(real(v)), values, steps))
-
-
-def lowered(
-    energy: Callable[[dict[str, Tensor]], Energy], start: dict[str, Tensor], steps: int
-) -> dict[str, Tensor]:
-    """Lower an energy of named tensors by L-BFGS with a strong Wolfe line search.
-
-    Raises:
-        ValueError: If the energy is not finite at the start.
-    """
-    values = {n: v.detach().clone().requires_grad_() for n, v in start.items()}
-    solver = torch.optim.LBFGS(
-        list(values.values()), max_iter=steps, max_eval=2 * steps, history_size=20,
-        tolerance_grad=1e-6, tolerance_change=1e-9, line_search_fn="strong_wolfe",
-    )  # fmt: skip
-
-    def closure() -> Float[Tensor, ""]:
-        solver.zero_grad()
-        value = energy(values).total
-        torch.autograd.backward(value)
-        return value
-
-    first = solver.step(closure)  # pyright: ignore[reportArgumentType]
-    if not bool(torch.as_tensor(first).isfinite()):
-        raise ValueError("the energy of the bodies is not finite")
-    return {n: v.detach() for n, v in values.items()}
+    return real(solved(values, values, lambda v: energy(real(v)).total, steps, 2 * steps, 1e-6))

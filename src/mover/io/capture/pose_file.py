@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mover.bodies import BodyModel, load_model
+from mover.bodies import load_model, run_model
 from mover.core.errors import InputError
 from mover.core.files import reason
 from mover.core.records import rows_of
@@ -27,7 +27,6 @@ GENDERS = ("neutral", "female", "male")
 ANGLES = (63, 69)  # of SMPL-X and SMPL-H, of SMPL
 SAME = 0.01  # [m], a model that comes so close gives the same meshes
 LOOKED_AT = 64  # so many rows are compared, spread over the video
-CHUNK = 128  # rows posed at once
 NO_TURN = 1e-6
 UNUSABLE = (InputError, ValueError, RuntimeError, KeyError, OSError)
 """What a model raises that is not there, or cannot take the parameters."""
@@ -159,18 +158,6 @@ def joined_bodies(parts: Sequence[Bodies]) -> Bodies:
 
 
 # Parameters of bodies: posed, and moved as rigid bodies, whose root turns about the pelvis.
-
-
-def run_model(
-    model: BodyModel, pose: BodyPose
-) -> tuple[Float[Tensor, "bodies verts 3"], Float[Tensor, "bodies joints 3"]]:
-    """Vertices and joints, some rows at a time to bound the memory [m]."""
-    with torch.no_grad():
-        parts = [
-            model.posed(rows_of(pose, index))
-            for index in torch.arange(len(pose.transl)).split(CHUNK)
-        ]
-    return torch.cat([verts for verts, _ in parts]), torch.cat([joints for _, joints in parts])
 
 
 def moved(pose: BodyPose, R: Float[Tensor, "bodies 3 3"], t: Float[Tensor, "bodies 3"]) -> BodyPose:

@@ -8,12 +8,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mover.bodies import BodyModel, load_model
+from mover.bodies import BodyModel, load_model, run_model
 from mover.bodies.skinning import FLAT, HAND_POSES, SkinnedBody
 from mover.core.errors import InputError
 from mover.core.records import record
 from mover.core.types import Bodies, BodyPose
-from mover.io.capture.pose_file import NEEDED, run_model
+from mover.io.capture.pose_file import NEEDED
 from mover.io.capture.tracks import join_pieces, renumbered, seen_at
 from mover.io.files.fields import LARGEST, At, listed
 from mover.io.files.meshes import read_mesh

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mover.bodies import load_model
-from mover.bodies.corrected import Correction, corrected
+from mover.bodies.corrected import corrected, no_correction
 from mover.bodies.parts import BodyParts, members
 from mover.bodies.posture import postures
-from mover.bodies.skeleton import BODY
+from mover.bodies.skeleton import BODY, SIDES
 from mover.bodies.skinning import vertex_subset
 from mover.core.types import Bodies
 from mover.energy.body_terms import Neighbours, gather_neighbours
@@ -42,7 +42,6 @@ REACHED = 0.002  # [m], how near a foot is brought
 STEPS = 3  # of Gauss and Newton
 SPOTS = 4  # points of a sole
 LEG = ("hip", "knee", "ankle")
-SIDES = ("left", "right")
 NUDGE = 1e-3  # [rad], for differences
 
 
@@ -62,10 +61,8 @@ def plant_feet(bodies: Bodies, parts: BodyParts, floor: float) -> Bodies:
         return bodies
     calm = (posture.sitting | posture.lying).double()
     shift = _shifts(bodies, near, rest, calm, soles, floor)
-    zero, pose = torch.zeros_like(bodies.verts[:, 0]), bodies.pose
-    width = 0 if pose is None else pose.body_pose.shape[-1]
-    moved = corrected(bodies, Correction(shift.to(zero), zero, zero.new_zeros(len(zero), width)))
-    if pose is None:
+    moved = corrected(bodies, replace(no_correction(bodies), shift=shift.to(bodies.verts)))
+    if bodies.pose is None:
         return moved
     lying = postures(moved, parts, floor).lying
     rest = resting_soles(moved, parts, lying).double()
@@ -236,5 +233,4 @@ def _bend(
             angles = angles + torch.linalg.solve(normal, right)
     whole = torch.zeros_like(pose.body_pose)
     whole[:, columns] = angles.to(whole)
-    zero = torch.zeros_like(bodies.verts[:, 0])
-    return corrected(bodies, Correction(zero, zero, whole))
+    return corrected(bodies, replace(no_correction(bodies), angles=whole))

@@ -24,6 +24,7 @@ from mover.bodies.corrected import (
 )
 from mover.bodies.parts import parts_of
 from mover.bodies.posture import postures, touching
+from mover.bodies.skeleton import SIDES
 from mover.bodies.skin import PARTS
 from mover.core.errors import InputError
 from mover.core.observe import Energy, Observer, silent
@@ -57,8 +58,6 @@ from mover.stages.people.body_evidence import (
 )
 from mover.stages.people.body_outlines import SeenBodies, gather_outlines
 from mover.stages.people.plant_feet import plant_feet
-
-SIDES = ("left", "right")
 
 
 @dataclass(frozen=True)
@@ -310,9 +309,7 @@ def _refined(
         range(len(scene.bodies.frame)),
         key=lambda k: (int(scene.bodies.person[k]), int(scene.bodies.frame[k])),
     )
-    pose, zero = scene.bodies.pose, torch.zeros(len(order), 3)
-    width = 0 if pose is None else pose.body_pose.shape[-1]
-    found, energy = Correction(zero, zero, zero.new_zeros(len(order), width)), zero[:, 0].clone()
+    found, energy = no_correction(scene.bodies), torch.zeros(len(order))
     for first in range(0, len(order), config.rows):
         inner = torch.tensor(order[first : first + config.rows])
         start = max(0, first - config.overlap)
@@ -362,6 +359,5 @@ def _refine(
 def _started(puppet: Puppet, by: Correction) -> Correction:
     """The same correction with the angles of this puppet, which were not free before."""
     none = no_correction(puppet)
-    return (
-        by if none.angles.shape == by.angles.shape else replace(none, shift=by.shift, turn=by.turn)
-    )
+    same = none.angles.shape == by.angles.shape
+    return by if same else replace(none, shift=by.shift, turn=by.turn)
