@@ -59,39 +59,24 @@ FORMATS = (
     Format("capture", "folder", "a capture folder", "capture.folder:read_capture"),
     Format("capture", "total3d", "a folder of Total3D or Im3D", "scenes.total3d:read_total3d"),
     Format("scene", "folder", "another capture, or a part of one", "capture.folder:folder_parts"),
-    Format(
-        "scene", "total3d", "a folder of Total3D or Implicit3D (input/ and output/, or one)",
-        "scenes.total3d:total3d_parts",
-    ),
-    Format(
-        "scene", "sam3d", "a folder of SAM 3D Objects: meshes and their poses",
-        "scenes.sam3d:sam3d_parts",
-    ),
+    Format("scene", "total3d", "a folder of Total3D or Implicit3D (input/ and output/, or one)",
+           "scenes.total3d:total3d_parts"),
+    Format("scene", "sam3d", "a folder of SAM 3D Objects: meshes and their poses",
+           "scenes.sam3d:sam3d_parts"),
     Format("scene", "glb", "a glTF scene: each node an object", "scenes.glb_scene:glb_parts"),
-    Format(
-        "scene", "boxes", "3D boxes (JSON); meshes come from the furniture library",
-        "scenes.box_scene:box_parts",
+    Format("scene", "boxes", "3D boxes (JSON); meshes come from the furniture library",
+           "scenes.box_scene:box_parts"),
+    *(
+        Format("dataset", name, what, f"mover_bench.datasets.{name}:{name}_parts")
+        for name, what in (
+            ("holisticmesh", "a folder of HolisticMesh: models/scene.ply, detections.json"),
+            ("release", "a sequence of the MOVER authors' release"),
+            ("prox", "PROX, qualitative or quantitative: one --recording"),
+            ("pigraphs", "PiGraphs: one --recording"),
+        )
     ),
-    Format(
-        "dataset", "holisticmesh", "a folder of HolisticMesh: models/scene.ply, detections.json",
-        "mover_bench.datasets.holisticmesh:holisticmesh_parts",
-    ),
-    Format(
-        "dataset", "release", "a sequence of the MOVER authors' release",
-        "mover_bench.datasets.release:release_parts",
-    ),
-    Format(
-        "dataset", "prox", "PROX, qualitative or quantitative: one --recording",
-        "mover_bench.datasets.prox:prox_parts",
-    ),
-    Format(
-        "dataset", "pigraphs", "PiGraphs: one --recording",
-        "mover_bench.datasets.pigraphs:pigraphs_parts",
-    ),
-    Format(
-        "masks", "masks", "masks alone: COCO, labelme, PNG, npz",
-        "masks.instance_files:mask_parts",
-    ),
+    Format("masks", "masks", "masks alone: COCO, labelme, PNG, npz",
+           "masks.instance_files:mask_parts"),
     *(
         Format("people", name, what, "people.tools:read", {"tool": name})
         for name, what in (
@@ -118,17 +103,13 @@ FORMATS = (
     Format("cameras", "vggt", "predictions.npz of VGGT", "people.paths:read_vggt"),
     Format("cameras", "vipe", "a folder of ViPE", "people.paths:read_vipe"),
     Format("cameras", "wham", "slam_results.pth of WHAM", "people.paths:read_slam"),
-    Format(
-        "keypoints", "coco17", "COCO's 17 joints: JSON", "people.keypoints:read_instances",
-        {"layout": "coco17"},
-    ),
-    Format(
-        "keypoints", "halpe26", "Halpe's 26 joints: JSON",
-        "people.keypoints:read_instances", {"layout": "halpe26"},
-    ),
-    Format(
-        "keypoints", "mediapipe", "MediaPipe's 33 landmarks in pixels: JSON",
-        "people.keypoints:read_instances", {"layout": "mediapipe33"},
+    *(
+        Format("keypoints", name, what, "people.keypoints:read_instances", {"layout": layout})
+        for name, layout, what in (
+            ("coco17", "coco17", "COCO's 17 joints: JSON"),
+            ("halpe26", "halpe26", "Halpe's 26 joints: JSON"),
+            ("mediapipe", "mediapipe33", "MediaPipe's 33 landmarks in pixels: JSON"),
+        )
     ),
     Format("keypoints", "openpose", "a folder of OpenPose", "people.keypoints:read_openpose"),
     Format("export", "glb", "the room with moving people, one file", "export.glb:export_glb"),
@@ -172,7 +153,6 @@ def read(format: str, path: Path) -> "Capture":
         ValueError: If there is no such format.
         InputError: If the data is wrong.
     """
-    known = names("capture")
-    if format not in known:
+    if format not in (known := names("capture")):
         raise ValueError(f"format is {format!r}, choose one of {', '.join(sorted(known))}")
     return chosen("format", format, "capture")(Path(path))
