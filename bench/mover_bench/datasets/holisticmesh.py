@@ -20,7 +20,7 @@ import numpy as np
 from mover.core.errors import InputError
 from mover.geometry.rotations import affine
 from mover.io.capture.parts import Hints, Parts
-from mover.io.files.fields import At, choice, get, items, maybe, read_json, refuse, vector
+from mover.io.files.fields import At, read_json
 from mover.io.files.looks import load_parts
 from mover.io.files.meshes import load_arrays, mesh_of, read_mesh, write_mesh
 from mover.io.files.schema import rotation
@@ -48,20 +48,20 @@ def holisticmesh_parts(folder: Path, hints: Hints) -> Parts:
     if not (folder / "detections.json").is_file():
         why = "the one of its --data_path, whose order names the objects"
         raise InputError(f"detections.json: there is no such file in {folder}, expected {why}")
-    rows = items(read_json(folder / "detections.json"))
-    names = [choice(get(row, "class"), CLASSES) for row in rows]
+    rows = read_json(folder / "detections.json").items()
+    names = [row.get("class").choice(CLASSES) for row in rows]
     given = {} if hints.camera is None else dict(hints.camera.value)
-    tilt = None if hints.camera is None else maybe(hints.camera, "R_cam_world")
+    tilt = None if hints.camera is None else hints.camera.maybe("R_cam_world")
     R = np.array(LEVEL) if tilt is None else rotation(tilt)
     camera: dict[str, Any] = {**LENS, **given, "R_cam_world": R.tolist()}
     at = At(str(SCENE), str(SCENE))
     verts, faces = load_arrays(at, folder / SCENE)
     size, rest = divmod(len(verts), max(1, len(rows)))
     if not rows or rest:
-        refuse(at, f"as many vertices for each of {len(rows)} detections", f"{len(verts)} vertices")
+        at.refuse(f"as many vertices for each of {len(rows)} detections", f"{len(verts)} vertices")
     owner = faces // size
     if (owner != owner[:, :1]).any():
-        refuse(at, "faces of one object each", "faces that join two objects")
+        at.refuse("faces of one object each", "faces that join two objects")
     found, annotations = Pieces(), list[dict[str, Any]]()
     for i, (row, category) in enumerate(zip(rows, names, strict=True)):
         if category not in FURNITURE:
@@ -72,9 +72,9 @@ def holisticmesh_parts(folder: Path, hints: Hints) -> Parts:
         copy = partial(without_axes, file, affine(R.T))
         found.add(category, f"{category}_{i}", lambda key, c=copy: c(hints.work / f"{key}.glb"))
         found.rows[-1]["annotation"] = i
-        box = get(row, "bbox")  # of the mirrored picture, with a score where it has five numbers
+        box = row.get("bbox")  # of the mirrored picture, with a score where it has five numbers
         scored = isinstance(box.value, list) and len(box.value) == 5
-        left, top, right, bottom = vector(box, 5 if scored else 4)[:4]
+        left, top, right, bottom = box.vector(5 if scored else 4)[:4]
         place = [float(camera["w"]) - right, top, right - left, bottom - top]
         annotations.append({"id": i, "image_id": 0, "category_id": category, "bbox": place})
     how = "level, as --camera has no R_cam_world" if tilt is None else "as given"

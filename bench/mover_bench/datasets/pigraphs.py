@@ -13,7 +13,7 @@ from mover.core.errors import InputError
 from mover.geometry.rotations import affine
 from mover.io.capture.parts import Hints, Parts, image_parts
 from mover.io.capture.scene_file import write_scene
-from mover.io.files.fields import At, get, items, mapping, maybe, read_json, refuse, text, vector
+from mover.io.files.fields import At, read_json
 from mover.io.scenes.placing import Matrix
 from mover_bench.datasets.prox_files import world_of
 from mover_bench.datasets.true_boxes import SIGNS, TrueBox, boxes_scene, floor_in, read_scan
@@ -114,7 +114,7 @@ def pigraphs_parts(root: Path, hints: Hints) -> Parts:
     """
     path = _recording(root, hints.recording)
     at = read_json(path)
-    matrix = _matrix(get(at, "camera"))
+    matrix = _matrix(at.get("camera"))
     mirror = float(np.linalg.det(matrix[:3, :3])) < 0
     to_camera = RIGHT_UP if mirror else LEFT_UP
     lens = LENS if hints.camera is None else hints.camera.value
@@ -161,22 +161,22 @@ def _recording(root: Path, name: str) -> Path:
 
 def _matrix(at: At) -> Matrix:
     """16 numbers by rows: the scan from Kinect's camera space (4, 4), rigid or a mirror."""
-    out = np.array(vector(at, 16)).reshape(4, 4)
+    out = np.array(at.vector(16)).reshape(4, 4)
     turn = out[:3, :3]
     if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-2 or out[3].tolist() != [0, 0, 0, 1]:
-        refuse(at, "16 numbers of a rigid transform, by rows")
+        at.refuse("16 numbers of a rigid transform, by rows")
     return out
 
 
 def _skeletons(at: At) -> list[tuple[int, int, Matrix]]:
     """Frame, person and joints (25, 3) [m] of each skeleton."""
-    times = maybe(at, "depthTimestamps")
-    clock = np.array([] if times is None else [_time(item) for item in items(times)])
+    times = at.maybe("depthTimestamps")
+    clock = np.array([] if times is None else [_time(item) for item in times.items()])
     people: dict[str, int] = {}
     seen: dict[tuple[int, int], Matrix] = {}
-    for place, item in enumerate(items(get(at, "skeletons"))):
-        joints = np.array([vector(row, 3) for row in items(get(item, "jointPositions"), JOINTS)])
-        key, stamp = maybe(item, "trackingId"), maybe(item, "timestamp")
+    for place, item in enumerate(at.get("skeletons").items()):
+        joints = np.array([row.vector(3) for row in item.get("jointPositions").items(JOINTS)])
+        key, stamp = item.maybe("trackingId"), item.maybe("timestamp")
         person = people.setdefault("" if key is None else str(key.value)[:40], len(people))
         frame = place
         if len(clock) and stamp is not None:
@@ -190,8 +190,8 @@ def _time(at: At) -> float:
     try:
         value = float(at.value)
     except (TypeError, ValueError, OverflowError):
-        return refuse(at, "a time")
-    return value if np.isfinite(value) else refuse(at, "a time")
+        return at.refuse("a time")
+    return value if np.isfinite(value) else at.refuse("a time")
 
 
 def _with_truth(parts: Parts, root: Path, room: str, scan_cam: Matrix) -> Parts:
@@ -216,30 +216,30 @@ def _with_truth(parts: Parts, root: Path, room: str, scan_cam: Matrix) -> Parts:
 def read_segments(path: Path) -> list[TrueBox]:
     """The furniture of segs.json: groups that are parts of one object are one box."""
     groups: dict[str, list[TrueBox]] = {}
-    for item in items(get(read_json(path), "segGroups")):
-        label = text(get(item, "label")).lower()
+    for item in read_json(path).get("segGroups").items():
+        label = item.get("label").text().lower()
         whole = label.split(":")[0].strip().replace("_", " ")
-        if whole not in LARGE or maybe(item, "obb") is None:
+        if whole not in LARGE or item.maybe("obb") is None:
             continue
-        key = maybe(item, "objectId")
-        name = f"{whole}_{str(get(item, 'id').value if key is None else key.value)[:20]}"
-        groups.setdefault(name, []).append(_obb(get(item, "obb"), name, whole, item))
+        key = item.maybe("objectId")
+        name = f"{whole}_{str(item.get('id').value if key is None else key.value)[:20]}"
+        groups.setdefault(name, []).append(_obb(item.get("obb"), name, whole, item))
     return [_union(boxes) for boxes in groups.values()]
 
 
 def _obb(at: At, name: str, category: str, item: At) -> TrueBox:
     """One box: full lengths; axes by rows or by columns, whichever has the vertical in it."""
-    mapping(at)
-    axes = np.array(vector(get(at, "normalizedAxes"), 9)).reshape(3, 3)
+    at.mapping()
+    axes = np.array(at.get("normalizedAxes").vector(9)).reshape(3, 3)
     if np.abs(axes @ axes.T - np.eye(3)).max() > 1e-2:
-        refuse(get(at, "normalizedAxes"), "three axes at right angles, of length 1")
-    normal = maybe(item, "dominantNormal")
-    known = np.array([0.0, 0, 1]) if normal is None else np.array(vector(normal, 3))
+        at.get("normalizedAxes").refuse("three axes at right angles, of length 1")
+    normal = item.maybe("dominantNormal")
+    known = np.array([0.0, 0, 1]) if normal is None else np.array(normal.vector(3))
     by_rows, by_columns = np.abs(axes @ known).max(), np.abs(axes.T @ known).max()
     if by_columns > by_rows + 1e-6:
         axes = axes.T
-    half = np.array(vector(get(at, "axesLengths"), 3)) / 2
-    return TrueBox(name, category, np.array(vector(get(at, "centroid"), 3)), np.abs(half), axes)
+    half = np.array(at.get("axesLengths").vector(3)) / 2
+    return TrueBox(name, category, np.array(at.get("centroid").vector(3)), np.abs(half), axes)
 
 
 def _union(boxes: list[TrueBox]) -> TrueBox:

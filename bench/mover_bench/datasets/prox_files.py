@@ -19,7 +19,7 @@ from mover.core.errors import InputError
 from mover.core.types import Bodies, Camera, Masks
 from mover.geometry.rle import area
 from mover.geometry.rotations import affine
-from mover.io.files.fields import At, get, items, mapping, maybe, number, read_json, reason, refuse
+from mover.io.files.fields import At, read_json, reason
 from mover.io.masks.instances import Instance, Instances, code_of, people_tree
 from mover.io.people.values import frame_numbers
 from mover.io.scenes.placing import Matrix
@@ -291,25 +291,25 @@ def keypoint_trees(
         mirrored, why = vote, "as the fitted bodies say"
     notes.append(f"the keypoints were {'flipped' if mirrored else 'kept'}, {why}")
     return {
-        f"keypoints/{frame:06d}_keypoints.json": _flipped(at) if mirrored else dict(mapping(at))
+        f"keypoints/{frame:06d}_keypoints.json": _flipped(at) if mirrored else dict(at.mapping())
         for frame, at in trees.items()
     }
 
 
 def _triples(at: At) -> NDArray[np.float64]:
     """x, y and confidence."""
-    values = [number(v) for v in items(at)]
+    values = [v.number() for v in at.items()]
     if len(values) % 3:
-        refuse(at, "triples of x, y, confidence")
+        at.refuse("triples of x, y, confidence")
     return np.array(values).reshape(-1, 3)
 
 
 def _middle(at: At) -> float | None:
     """Mean x of what is seen of the first person."""
-    people = items(get(at, "people"))
+    people = at.get("people").items()
     if not people:
         return None
-    joints = _triples(get(people[0], BODY))
+    joints = _triples(people[0].get(BODY))
     seen = joints[joints[:, 2] > SURE]
     return float(seen[:, 0].mean()) if len(seen) else None
 
@@ -330,16 +330,16 @@ def _vote(stored: dict[int, float | None], bodies: Bodies, camera: Camera) -> bo
 def _flipped(at: At) -> dict[str, Any]:
     """A file of a mirrored picture as that of the true one: left is right."""
     people: list[dict[str, Any]] = []
-    for person in items(get(at, "people")):
-        row = dict(mapping(person))
-        hands = {LEFT: maybe(person, RIGHT), RIGHT: maybe(person, LEFT)}
-        parts = {BODY: maybe(person, BODY), HEAD: maybe(person, HEAD), **hands}
+    for person in at.get("people").items():
+        row = dict(person.mapping())
+        hands = {LEFT: person.maybe(RIGHT), RIGHT: person.maybe(LEFT)}
+        parts = {BODY: person.maybe(BODY), HEAD: person.maybe(HEAD), **hands}
         for key, given in parts.items():
             if given is not None:
                 pairs = PAIRS_25 if key == BODY else FACE if key == HEAD else ()
                 row[key] = _mirror(_triples(given), pairs).ravel().tolist()
         people.append(row)
-    return {**mapping(at), "people": people}
+    return {**at.mapping(), "people": people}
 
 
 def _mirror(joints: NDArray[np.float64], pairs: tuple[tuple[int, int], ...]) -> NDArray[np.float64]:

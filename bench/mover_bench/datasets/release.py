@@ -27,7 +27,7 @@ from mover.io.capture.camera_file import camera_of
 from mover.io.capture.parts import Hints, Parts
 from mover.io.capture.scene_file import scene_of, scene_tree, write_scene
 from mover.io.files.cameras import read_camera_file
-from mover.io.files.fields import At, get, items, maybe, read_json
+from mover.io.files.fields import At, read_json
 from mover.io.files.npz import read_npy
 from mover.io.masks.instance_files import list_instances
 from mover.io.masks.instances import Instance, Instances, fitted, is_person, people_tree
@@ -132,7 +132,7 @@ def release_parts(folder: Path, hints: Hints) -> Parts:
     size = lens["w"], lens["h"]
     notes: list[str] = []
     xml = found(folder, "001.xml")
-    R = None if xml is None else np.array(get(read_camera_file(xml, size), "R_cam_world").value)
+    R = None if xml is None else np.array(read_camera_file(xml, size).get("R_cam_world").value)
     if R is None:
         notes.append("there is no smplifyx_cam/001.xml, so the bodies' world is not known")
     bodies, first = body_arrays(folder, R, notes)
@@ -201,14 +201,14 @@ def _authors(folder: Path, parts: Parts, R: Matrix | None, notes: list[str]) -> 
     paths = sorted(folder.glob("**/f[0-9][0-9][0-9]_world.obj"), key=lambda p: (p.parent, p.name))
     assert parts.scene is not None
     assert parts.camera is not None
-    rows = items(get(parts.scene, "objects"))
+    rows = parts.scene.get("objects").items()
     last = [p for p in paths if p.parent == paths[-1].parent] if paths else []
     if R is None or len(last) != len(rows):
         if last:
             notes.append(f"their result has {len(last)} objects, {len(rows)} are known: left out")
         return {}
     placed: list[dict[str, Any]] = []
-    meshes = {row.value["mesh"]: parts.load_mesh(get(row, "mesh")) for row in rows}
+    meshes = {row.value["mesh"]: parts.load_mesh(row.get("mesh")) for row in rows}
     for row, path in zip(rows, last, strict=True):
         verts = meshes[row.value["mesh"]][0].verts.double().numpy()
         theirs = _used(path, len(verts)) @ FLIP
@@ -241,7 +241,7 @@ def _truth(folder: Path, camera: dict[str, Any], hints: Hints) -> dict[str, Scen
     if path is None:
         return {}
     boxes = read_bbox3d(path, hints.names, read_json(path))
-    guess = maybe(At(camera, "camera"), "R_cam_world")
+    guess = At(camera, "camera").maybe("R_cam_world")
     first = FLIP if guess is None else np.array(guess.value)
     R = level_of(vertical_of(boxes, first[:, 1]))
     world = affine(R.T)

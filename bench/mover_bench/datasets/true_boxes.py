@@ -16,7 +16,7 @@ from mover.core.errors import InputError
 from mover.core.types import Mesh, Scene
 from mover.io.capture.camera_file import camera_of
 from mover.io.capture.scene_file import scene_of, scene_tree
-from mover.io.files.fields import At, get, mapping, refuse, vector
+from mover.io.files.fields import At
 from mover.io.files.meshes import read_mesh
 from mover.io.scenes.placing import Matrix, category_of_name, free_id, load_from
 
@@ -49,17 +49,17 @@ def read_bbox3d(path: Path, names: Mapping[str, str], file: At) -> list[TrueBox]
     The page does not say whether the axes are the rows or the columns of `basis`: the reading in
     which the boxes agree better on what is up counts. `names` are categories by id.
     """
-    rows = {key: get(file, key) for key in mapping(file)}
+    rows = {key: file.get(key) for key in file.mapping()}
     if not rows:
         raise InputError(f"{path.name}: has no boxes, expected {{id: {{centroid, basis, coeffs}}}}")
-    bases = {key: _basis(get(row, "basis")) for key, row in rows.items()}
+    bases = {key: _basis(row.get("basis")) for key, row in rows.items()}
     turned = _agree([b.T for b in bases.values()]) > _agree(list(bases.values())) + 1e-6
     return [
         TrueBox(
             name=key,
             category=names.get(key) or category_of_name(key),
-            center=np.array(_flat(get(row, "centroid"))),
-            half=np.abs(np.array(_flat(get(row, "coeffs")))),
+            center=np.array(_flat(row.get("centroid"))),
+            half=np.abs(np.array(_flat(row.get("coeffs")))),
             axes=bases[key].T if turned else bases[key],
         )
         for key, row in rows.items()
@@ -69,16 +69,16 @@ def read_bbox3d(path: Path, names: Mapping[str, str], file: At) -> list[TrueBox]
 def _flat(at: At) -> list[float]:
     """Three numbers, maybe in a list of one list."""
     inner = at.value[0] if isinstance(at.value, list) and len(at.value) == 1 else at.value
-    return vector(At(inner, at.file, at.field), 3)
+    return at.holding(inner).vector(3)
 
 
 def _basis(at: At) -> Matrix:
     """Three axes of length 1."""
     if not isinstance(at.value, list) or len(at.value) != 3:
-        refuse(at, "three axes of three numbers")
-    rows = np.array([vector(At(r, at.file, f"{at.field}[{i}]"), 3) for i, r in enumerate(at.value)])
+        at.refuse("three axes of three numbers")
+    rows = np.array([At(r, at.file, f"{at.field}[{i}]").vector(3) for i, r in enumerate(at.value)])
     if np.abs(rows @ rows.T - np.eye(3)).max() > 1e-2:
-        refuse(at, "three axes at right angles, of length 1")
+        at.refuse("three axes at right angles, of length 1")
     return rows
 
 

@@ -26,7 +26,7 @@ from mover.io.capture.edits import Edit, write_edits
 from mover.io.capture.scene_file import write_scene
 from mover.io.export.contacts import write_labels
 from mover.io.export.scene_glb import write_glb
-from mover.io.files.fields import get, read_json, refuse
+from mover.io.files.fields import read_json
 from mover.pipeline.presets import Config
 from mover.pipeline.result import label_inputs
 from mover.stages.contacts.label_contacts import LabelConfig, label_contacts
@@ -170,7 +170,7 @@ def read_config(path: Path) -> Config:
     Raises:
         InputError: If there is none, or a setting in it is wrong.
     """
-    at = get(read_json(path), "config")
+    at = read_json(path).get("config")
     if not isinstance(at.value, Mapping):
-        refuse(at, "the settings of a run {...}")
+        at.refuse("the settings of a run {...}")
     return read_settings(Config, at.value, f"{path}: config")

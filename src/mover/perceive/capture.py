@@ -35,7 +35,7 @@ from mover.io.capture.camera_file import camera_of, camera_to_json
 from mover.io.capture.folder import folder_parts
 from mover.io.capture.scene_file import write_hypotheses, write_scene
 from mover.io.files.cameras import guessed_view, of_view, read_camera_file, with_spread
-from mover.io.files.fields import At, get, maybe, number, read_json, write_json
+from mover.io.files.fields import At, read_json, write_json
 from mover.io.files.images import find_depth_file, opened, read_depth, reference_frame, write_image
 from mover.io.people.keypoints import write_keypoints
 from mover.perceive import mediapipe, networks
@@ -309,7 +309,7 @@ def _in_pixels_of(size: tuple[int, int], at: At) -> At:
     Raises:
         InputError: If the calibration is of pictures of another format.
     """
-    own = tuple(int(number(get(at, name), 1, 1e5)) for name in ("w", "h"))
+    own = tuple(int(at.get(name).number(1, 1e5)) for name in ("w", "h"))
     if abs(own[0] * size[1] - own[1] * size[0]) > SAME_FORMAT * own[0] * size[1]:
         raise InputError(
             f"{at.file}: is of pictures of {own[0]} x {own[1]} pixels, expected the format of the "
@@ -318,7 +318,7 @@ def _in_pixels_of(size: tuple[int, int], at: At) -> At:
     zoom = {"fl_x": size[0] / own[0], "cx": size[0] / own[0]}
     zoom |= {"fl_y": size[1] / own[1], "cy": size[1] / own[1]}
     scaled = {k: v if k not in zoom else zoom[k] * float(v) for k, v in at.value.items()}
-    return At({**scaled, "w": size[0], "h": size[1]}, at.file, at.field)
+    return at.holding({**scaled, "w": size[0], "h": size[1]})
 
 
 def exif_focal(photo: Path, size: tuple[int, int]) -> float | None:
@@ -359,13 +359,13 @@ def read_picture_of(folder: Path) -> Picture:
         for row in range(0 if reference is None else len(reference.counts)):
             assert reference is not None
             hidden = hidden | decode(reference, row)
-    known, depth = maybe(given, "height"), find_depth_file(folder)
+    known, depth = given.maybe("height"), find_depth_file(folder)
     return Picture(
         camera=camera,
         detections=detections,
         masks=torch.stack(masks) if masks else blank[None][:0],
         people=hidden,
-        height=None if known is None else number(known, 0.1, 100.0),
+        height=None if known is None else known.number(0.1, 100.0),
         depth=None
         if depth is None or not depth[1]  # in metres
         else read_depth(depth[0], camera, frame=reference_frame(folder)),
@@ -383,7 +383,7 @@ def _guessed(folder: Path, camera: Camera) -> Camera:
     if not file.is_file():
         return camera
     try:
-        before, found = (camera_of(get(read_json(file), name)) for name in ("before", "found"))
+        before, found = (camera_of(read_json(file).get(name)) for name in ("before", "found"))
     except InputError:  # a cache: what is damaged is no news
         return camera
     same = torch.allclose(found.R_cam_world, camera.R_cam_world, rtol=0, atol=SAME_TILT)

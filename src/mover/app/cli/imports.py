@@ -142,7 +142,7 @@ def _parts(args: ImportArgs, main: "Parts", hints: "Hints") -> "list[Parts]":
     from mover.io.capture.bodies_file import read_body_arrays
     from mover.io.capture.parts import Parts, image_parts
     from mover.io.capture.tracks import renumbered
-    from mover.io.files.fields import At, array, get
+    from mover.io.files.fields import At
     from mover.io.files.npz import read_npz
 
     found = [main]
@@ -155,7 +155,7 @@ def _parts(args: ImportArgs, main: "Parts", hints: "Hints") -> "list[Parts]":
     if args.bodies is not None:
         bodies = read_body_arrays(args.bodies, args.fps) if not args.bodies_from else None
         if bodies is not None and args.tracks:
-            person = renumbered(torch.from_numpy(array(get(bodies, "person"), ("B",), "whole")),
+            person = renumbered(torch.from_numpy(bodies.get("person").array(("B",), "whole")),
                                 tracks_of(args.tracks))  # fmt: skip
             bodies = At({**bodies.value, "person": person.numpy()}, bodies.file)
         bodies = bodies or _bodies_of_tool(args, [*found, extra], hints)

@@ -24,7 +24,7 @@ from mover.io.capture.edits import (
     write_edits,
 )
 from mover.io.capture.scene_file import read_scene
-from mover.io.files.fields import At, mapping, read_json
+from mover.io.files.fields import At, read_json
 from mover.io.files.images import read_image_file
 
 
@@ -48,7 +48,7 @@ class Shown:
 def read_shown(out: Path) -> Shown:
     """Read what `mover run` left in its folder."""
     result = read_scene(out / "scene.json")
-    log = mapping(read_json(out / "run.json")) if (out / "run.json").is_file() else {}
+    log = read_json(out / "run.json").mapping() if (out / "run.json").is_file() else {}
     first = out / "initial.json"
     people = [
         read_bodies(file) if (file := out / name).is_file() else None

@@ -13,7 +13,7 @@ from torch import Tensor
 from mover.core.types import Camera, Detection, Masks, People
 from mover.geometry.boxes import iou2d
 from mover.geometry.rle import area, joined, mask_boxes
-from mover.io.files.fields import At, Warn, get, items, listed, maybe, plain, refuse, shown, unique
+from mover.io.files.fields import At, Warn, listed, plain, shown, unique
 from mover.io.files.schema import Box, FrameRate, Id, Index, Share, checked
 from mover.io.masks.coco import (
     annotations_tree,
@@ -39,20 +39,20 @@ class AnnotationFields(Struct, frozen=True):
 def detections_of(at: At, camera: Camera, warn: Warn) -> tuple[Detection, ...]:
     """The instances of objects.json."""
     image = check_image(_only_image(at), camera)
-    names = categories_of(get(at, "categories"))
+    names = categories_of(at.get("categories"))
     known, found = set[object](), list[Detection]()
-    for item in items(get(at, "annotations")):
+    for item in at.get("annotations").items():
         row = checked(item, AnnotationFields)
         if row.image_id != image:
-            refuse(get(item, "image_id"), f"{image}, the id of the one image")
-        box = _box_of(get(item, "bbox"), row.bbox, camera, warn)
+            item.get("image_id").refuse(f"{image}, the id of the one image")
+        box = _box_of(item.get("bbox"), row.bbox, camera, warn)
         mask = mask_of(item, camera, warn)
         if mask is not None:
             _check_mask(item, mask, box, warn)
-        category = category_of(get(item, "category_id"), names)
+        category = category_of(item.get("category_id"), names)
         score = 1.0 if row.score is None else row.score
         found.append(Detection(row.id, category, box, mask, score))
-        unique(get(item, "id"), known, row.id, "an id")
+        unique(item.get("id"), known, row.id, "an id")
     bare = [d.id for d in found if d.mask is None]
     if bare:
         warn(f"{at.file}: {listed('annotation', bare)} without segmentation, only the box counts")
@@ -61,29 +61,29 @@ def detections_of(at: At, camera: Camera, warn: Warn) -> tuple[Detection, ...]:
 
 def image_name(at: At) -> At | None:
     """The field that names the reference image, None if it is not given."""
-    return maybe(_only_image(at), "file_name")
+    return _only_image(at).maybe("file_name")
 
 
 def _only_image(at: At) -> At:
     """The one image of objects.json."""
-    images = items(get(at, "images"))
+    images = at.get("images").items()
     if len(images) > 1:
-        named = [shown(get(image, "file_name").value) for image in images[:3]]
+        named = [shown(image.get("file_name").value) for image in images[:3]]
         how = (
             "`mover import masks FILE --image PICTURE --out FOLDER` takes that of a picture's name"
         )
         found = f"{len(images)} images ({', '.join(named)}, ...)"
-        refuse(get(at, "images"), f"a list of 1; {how}", found)
-    return items(get(at, "images"), 1)[0]
+        at.get("images").refuse(f"a list of 1; {how}", found)
+    return at.get("images").items(1)[0]
 
 
 def _box_of(at: At, box: Box, camera: Camera, warn: Warn) -> Float[Tensor, "4"]:
     """x_min, y_min, x_max, y_max of a COCO box [px]."""
     x, y, w, h = box
     if w <= 0 or h <= 0:
-        refuse(at, "[x, y, w, h] with w, h above 0")
+        at.refuse("[x, y, w, h] with w, h above 0")
     if x >= camera.width or y >= camera.height or x + w <= 0 or y + h <= 0:
-        refuse(at, f"a box inside the image of {camera.width} x {camera.height}")
+        at.refuse(f"a box inside the image of {camera.width} x {camera.height}")
     if x < -1 or y < -1 or x + w > camera.width + 1 or y + h > camera.height + 1:
         warn(f"{at.place} reaches beyond the image")
     return torch.tensor([x, y, x + w, y + h])
@@ -92,7 +92,7 @@ def _box_of(at: At, box: Box, camera: Camera, warn: Warn) -> Float[Tensor, "4"]:
 def _check_mask(at: At, mask: Masks, box: Float[Tensor, "4"], warn: Warn) -> None:
     """Refuse an empty mask, warn of one that is elsewhere than its box."""
     if not area(mask, 0):
-        refuse(get(at, "segmentation"), "a mask with pixels", "an empty mask")
+        at.get("segmentation").refuse("a mask with pixels", "an empty mask")
     if iou2d(box, mask_boxes(mask)[0]) < LEAST_OVERLAP:
         warn(f"{at.place} has a box and a mask in different places")
 
@@ -147,30 +147,30 @@ class PersonFields(Struct, frozen=True):
 
 def people_of(at: At, camera: Camera, warn: Warn) -> PeopleFile:
     """The people's visible masks in the frames, and in the reference image."""
-    info = maybe(at, "info")
+    info = at.maybe("info")
     known = InfoFields() if info is None else checked(info, InfoFields)
     heights: dict[str, float] = {}
     for key, value in (known.heights or {}).items():
         if not re.fullmatch("[0-9]{1,8}", key):
             field = At(value, at.file, f"info.heights.{key}")
-            refuse(field, "the number of a track as its name", f"the name {shown(key)}")
+            field.refuse("the number of a track as its name", f"the name {shown(key)}")
         heights[str(int(key))] = value
     frames: dict[int, None] = {}
-    for item in items(get(at, "images")):
+    for item in at.get("images").items():
         frame = check_image(item, camera)
         if frame in frames:
-            refuse(get(item, "id"), "a frame that is not used twice")
+            item.get("id").refuse("a frame that is not used twice")
         frames[frame] = None
-    given, hidden = maybe(at, "categories"), maybe(at, "reference_people")
+    given, hidden = at.maybe("categories"), at.maybe("reference_people")
     names = None if given is None else categories_of(given)
     pairs, known_pairs = list[tuple[int, int]](), set[object]()
-    for item in items(get(at, "annotations")):
+    for item in at.get("annotations").items():
         row = checked(item, PersonFields)
         if row.image_id not in frames:
-            refuse(get(item, "image_id"), "the id of one of the images")
+            item.get("image_id").refuse("the id of one of the images")
         pairs.append((row.image_id, row.track_id))
-        unique(get(item, "track_id"), known_pairs, pairs[-1], "a track of this frame")
-    masks = _masks_of(get(at, "annotations"), camera, names, warn)
+        unique(item.get("track_id"), known_pairs, pairs[-1], "a track of this frame")
+    masks = _masks_of(at.get("annotations"), camera, names, warn)
     rows = [(*pair, mask) for pair, mask in zip(pairs, masks, strict=True) if mask is not None]
     if missing := len(pairs) - len(rows):
         warn(f"{at.file}: {missing} of {len(pairs)} people without mask or an empty one")
@@ -192,8 +192,8 @@ def _masks_of(
 ) -> list[Masks | None]:
     """The visible masks of people; None where one is missing or empty."""
     masks: list[Masks | None] = []
-    for item in items(at):
-        category, box = maybe(item, "category_id"), maybe(item, "bbox")
+    for item in at.items():
+        category, box = item.maybe("category_id"), item.maybe("bbox")
         if category is not None and names is not None:
             category_of(category, names)
         if box is not None:
@@ -213,10 +213,10 @@ def furniture_of(
     """
     found = people_of(at, camera, warn).people
     known = {detection.id for detection in detections}
-    for index, item in enumerate(items(get(at, "annotations"))):
-        if get(item, "track_id").value not in known:
-            field = At(get(item, "track_id").value, at.file, f"annotations[{index}].track_id")
-            refuse(field, "the id of an annotation in objects.json")
+    for index, item in enumerate(at.get("annotations").items()):
+        if item.get("track_id").value not in known:
+            field = At(item.get("track_id").value, at.file, f"annotations[{index}].track_id")
+            field.refuse("the id of an annotation in objects.json")
     if found is None:
         warn(f"{at.file}: there are no masks of objects, expected some in its annotations")
     return found

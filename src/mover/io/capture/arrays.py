@@ -16,7 +16,7 @@ from mover.geometry.rle import encode, tight_box
 from mover.io.capture.build import build_capture
 from mover.io.capture.parts import Parts
 from mover.io.capture.scene_file import scene_tree
-from mover.io.files.fields import At, array, mapping, refuse
+from mover.io.files.fields import At
 from mover.io.files.meshes import mesh_of
 from mover.io.masks.coco import annotations_tree
 
@@ -109,9 +109,9 @@ def capture_from_arrays(
 def _load_mesh(objects: Sequence[ObjectArrays], at: At) -> tuple[Mesh, str]:
     """The mesh of an object that is named by its index."""
     given, field = objects[int(at.value)], f"objects[{at.value}]"
-    verts = array(At(np.asarray(given.vertices), FILE, f"{field}.vertices"), ("V", 3))
+    verts = At(np.asarray(given.vertices), FILE, f"{field}.vertices").array(("V", 3))
     faces = At(np.asarray(given.faces), FILE, f"{field}.faces")
-    return mesh_of(verts, array(faces, ("F", 3), "whole"), faces), given.mesh_file
+    return mesh_of(verts, faces.array(("F", 3), "whole"), faces), given.mesh_file
 
 
 def _scene(objects: Sequence[ObjectArrays]) -> At:
@@ -140,10 +140,10 @@ def _annotations(objects: Sequence[ObjectArrays]) -> dict[str, Any]:
             mask = _masks(o.mask, f"objects[{i}].mask", "h, w")
             if not mask.any():
                 field = At(o.mask, FILE, f"objects[{i}].mask")
-                refuse(field, "a mask with pixels", "an empty mask")
+                field.refuse("a mask with pixels", "an empty mask")
             box = tight_box(mask).tolist() if box is None else box
             row["segmentation"] = _code(mask)
-        x, y, right, bottom = array(At(np.asarray(box), FILE, f"objects[{i}].box"), (4,)).tolist()
+        x, y, right, bottom = At(np.asarray(box), FILE, f"objects[{i}].box").array((4,)).tolist()
         score = np.asarray(o.score).tolist()
         rows.append({**row, "bbox": [x, y, right - x, bottom - y], "score": score})
     return annotations_tree(rows, {})
@@ -153,7 +153,7 @@ def _masks(value: Numbers, field: str, axes: str) -> Tensor:
     """One mask or several."""
     given: NDArray[Any] = np.asarray(value)
     if given.dtype != np.bool_ or given.ndim != len(axes.split()):
-        refuse(At(given, FILE, field), f"an array of booleans of shape ({axes})")
+        At(given, FILE, field).refuse(f"an array of booleans of shape ({axes})")
     return torch.from_numpy(given)
 
 
@@ -166,10 +166,10 @@ def _people(people: PeopleArrays) -> dict[str, Any]:
     """The content of people.json."""
     masks, hidden = _masks(people.masks, "people.masks", "rows, h, w"), people.reference
     frames, persons = (
-        array(At(np.asarray(value), FILE, f"people.{name}"), (len(masks),), "whole").tolist()
+        At(np.asarray(value), FILE, f"people.{name}").array((len(masks),), "whole").tolist()
         for name, value in (("frame", people.frame), ("person", people.person))
     )
-    heights = {} if people.heights is None else mapping(At(people.heights, FILE, "people.heights"))
+    heights = {} if people.heights is None else At(people.heights, FILE, "people.heights").mapping()
     behind = () if hidden is None else _masks(hidden, "people.reference", "rows, h, w")
     return {
         "info": {"heights": heights},
@@ -185,9 +185,9 @@ def _people(people: PeopleArrays) -> dict[str, Any]:
 def _load_image(image: Numbers, camera: Camera) -> Float[Tensor, "h w 3"]:
     """The reference image in [0, 1]."""
     at = At(np.asarray(image), FILE, "image")
-    value = array(at, (camera.height, camera.width, 3)).astype(np.float32)
+    value = at.array((camera.height, camera.width, 3)).astype(np.float32)
     if at.value.dtype == np.uint8:
         value = value / np.float32(255)
     if value.min() < 0 or value.max() > 1:
-        refuse(at, "bytes, or numbers from 0 to 1")
+        at.refuse("bytes, or numbers from 0 to 1")
     return torch.from_numpy(value)

@@ -15,19 +15,7 @@ from mover.bodies.corrected import has_mean_shape
 from mover.core.errors import InputError
 from mover.core.types import Bodies
 from mover.io.capture.pose_file import pose_of, pose_to_arrays, posed, reproduces
-from mover.io.files.fields import (
-    FASTEST,
-    LAST_INDEX,
-    SLOWEST,
-    At,
-    Warn,
-    array,
-    choice,
-    get,
-    maybe,
-    number,
-    refuse,
-)
+from mover.io.files.fields import FASTEST, LAST_INDEX, SLOWEST, At, Warn
 from mover.io.files.looks import check_faces
 from mover.io.files.npz import AMASS, is_amass, read_npy, read_npz, write_npz
 from mover.io.formats import names
@@ -62,22 +50,22 @@ def bodies_of(at: At, warn: Warn) -> Bodies:
     """The bodies of named arrays: meshes where they are given, else the posed model."""
     if is_amass(at):
         raise InputError(f"{at.file}: is {AMASS}; expected bodies.npz")
-    frame = indices(get(at, "frame"), "B")
-    person = indices(get(at, "person"), len(frame))
+    frame = indices(at.get("frame"), "B")
+    person = indices(at.get("person"), len(frame))
     _check_rows(at, frame, person)
     pose = pose_of(at, len(frame))
-    given = maybe(at, "vertices")
+    given = at.maybe("vertices")
     if given is None and pose is None:
-        refuse(get(at, "vertices"), "meshes ('vertices', 'faces') or parameters ('body_pose', ...)")
+        at.get("vertices").refuse("meshes ('vertices', 'faces') or parameters ('body_pose', ...)")
     if given is None:
         assert pose is not None
         verts, faces, joints, names = posed(pose, at)
     else:
         verts = _places(given, (len(frame), "V", 3))
-        faces = _faces(get(at, "faces"), verts.shape[1])
+        faces = _faces(at.get("faces"), verts.shape[1])
         joints, names = _joints(at, len(frame))
-    space = get(at, "space")
-    word: Any = choice(At(str(array(space, (), "text")), at.file, space.field), ("camera", "world"))
+    space = at.get("space")
+    word: Any = At(str(space.array((), "text")), at.file, space.field).choice(("camera", "world"))
     spread = scalar(at, "size_spread", 0.0, 1.0)
     mean_shape = pose is not None and has_mean_shape(pose)  # before a pose is dropped unchecked
     fps = scalar(at, "fps", SLOWEST, FASTEST)
@@ -117,56 +105,56 @@ def odd_bodies(bodies: Bodies) -> list[str]:
 
 def indices(at: At, count: int | str) -> Int[Tensor, " rows"]:
     """Frames or tracks."""
-    value = array(at, (count,), "whole")
+    value = at.array((count,), "whole")
     bad = (value < 0) | (value > LAST_INDEX)
     if bad.any():
-        refuse(at, f"whole numbers from 0 to {LAST_INDEX}", f"{value[bad][0]}")
+        at.refuse(f"whole numbers from 0 to {LAST_INDEX}", f"{value[bad][0]}")
     return torch.from_numpy(value.astype(np.int64))
 
 
 def _check_rows(at: At, frame: Int[Tensor, " rows"], person: Int[Tensor, " rows"]) -> None:
     """Refuse an empty file and a person who is twice in a frame."""
     if not len(frame):
-        refuse(get(at, "frame"), "at least one row", "no rows")
+        at.get("frame").refuse("at least one row", "no rows")
     pairs, times = torch.stack([frame, person], 1).unique(dim=0, return_counts=True)
     if (times > 1).any():
         twice = pairs[times > 1][0].tolist()
         found = f"frame {twice[0]} of person {twice[1]} twice"
-        refuse(get(at, "frame"), "one row for each frame and person", found)
+        at.get("frame").refuse("one row for each frame and person", found)
 
 
 def _places(at: At, shape: tuple[int | str, ...]) -> Float[Tensor, "bodies points 3"]:
     """Vertices or joints [m]."""
-    value = array(at, shape)
+    value = at.array(shape)
     if not value.shape[1]:
-        refuse(at, "at least one point", "none")
+        at.refuse("at least one point", "none")
     return torch.from_numpy(value.astype(np.float32))
 
 
 def _faces(at: At, n_verts: int) -> Int[Tensor, "faces 3"]:
-    value = array(at, ("F", 3), "whole").astype(np.int64)
+    value = at.array(("F", 3), "whole").astype(np.int64)
     if not len(value):
-        refuse(at, "at least one face", "an empty mesh")
+        at.refuse("at least one face", "an empty mesh")
     check_faces(at, value, n_verts)
     return torch.from_numpy(value)
 
 
 def _joints(at: At, rows: int) -> tuple[Float[Tensor, "bodies joints 3"] | None, tuple[str, ...]]:
     """Joints and their names, both or neither."""
-    given, names = maybe(at, "joints"), maybe(at, "joint_names")
+    given, names = at.maybe("joints"), at.maybe("joint_names")
     if given is None and names is None:
         return None, ()
-    joints = _places(get(at, "joints"), (rows, "J", 3))
-    words = array(get(at, "joint_names"), (joints.shape[1],), "text")
+    joints = _places(at.get("joints"), (rows, "J", 3))
+    words = at.get("joint_names").array((joints.shape[1],), "text")
     return joints, tuple(str(word) for word in words)
 
 
 def scalar(at: At, name: str, least: float, most: float) -> float | None:
     """A number that may be missing."""
-    given = maybe(at, name)
+    given = at.maybe(name)
     if given is None:
         return None
-    return number(At(float(array(given, ())[()]), given.file, given.field), least, most)
+    return given.holding(float(given.array(())[()])).number(least, most)
 
 
 def write_bodies(bodies: Bodies, path: Path) -> None:
@@ -196,10 +184,10 @@ def bodies_to_arrays(bodies: Bodies) -> dict[str, NDArray[Any]]:
 
 def read_touch(at: At, bodies: Bodies) -> Float[Tensor, "bodies verts"]:
     """contacts.npz: the chance that a body's vertex touches something."""
-    field = get(at, "probability")
-    value = array(field, tuple(bodies.verts.shape[:2]))
+    field = at.get("probability")
+    value = field.array(tuple(bodies.verts.shape[:2]))
     if value.min() < 0 or value.max() > 1:
-        refuse(field, "probabilities from 0 to 1", f"{value.min():g} to {value.max():g}")
+        field.refuse("probabilities from 0 to 1", f"{value.min():g} to {value.max():g}")
     return torch.from_numpy(value.astype(np.float32))
 
 
@@ -250,6 +238,6 @@ def _array(path: Path) -> np.ndarray:
     if path.suffix != ".npz":
         return np.asarray(read_npy(path).value)
     at = read_npz(path)
-    if (given := maybe(at, *KEYS)) is None:
+    if (given := at.maybe(*KEYS)) is None:
         raise InputError(f"{path.name}: has {sorted(at.value)}, expected one of {list(KEYS)}")
     return np.asarray(given.value)

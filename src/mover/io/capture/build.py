@@ -16,7 +16,7 @@ from mover.io.capture.plausible import check_plausible
 from mover.io.capture.pose_file import into_camera
 from mover.io.capture.scene_file import hypotheses_of, scene_of
 from mover.io.capture.tracks import pair_tracks, paired
-from mover.io.files.fields import At, Warn, array, get, items, listed, refuse
+from mover.io.files.fields import At, Warn, listed
 from mover.io.files.schema import checked
 
 SLOW, FAST = 2.0, 250.0  # frames a second, of usual videos
@@ -57,9 +57,9 @@ def build_capture(parts: Parts) -> Capture:
         furniture = furniture_of(parts.furniture, camera, detections, warn)
     if parts.cameras is not None:
         path = path_of(parts.cameras, camera, bodies, warn)
-        space = None if parts.bodies is None or is_still(path) else get(parts.bodies, "space")
-        if space is not None and str(array(space, (), "text")) != "camera":
-            refuse(space, "'camera': cameras.npz carries people into the room's world", "'world'")
+        space = None if parts.bodies is None or is_still(path) else parts.bodies.get("space")
+        if space is not None and str(space.array((), "text")) != "camera":
+            space.refuse("'camera': cameras.npz carries people into the room's world", "'world'")
     capture = Capture(
         name=parts.name,
         scene=scene,
@@ -87,9 +87,9 @@ def _check_annotations(
 ) -> None:
     """Objects name annotations that exist; the others are named in warnings."""
     known, used = {d.id for d in detections}, {p.annotation for p in scene.objects}
-    for item, piece in zip(items(get(tree, "objects")), scene.objects, strict=True):
+    for item, piece in zip(tree.get("objects").items(), scene.objects, strict=True):
         if piece.annotation is not None and piece.annotation not in known:
-            refuse(get(item, "annotation"), f"the id of an annotation in {file}")
+            item.get("annotation").refuse(f"the id of an annotation in {file}")
     if bare := [piece.id for piece in scene.objects if piece.annotation is None]:
         warn(f"scene.json: {listed('object', bare)} without annotation, no evidence in the image")
     if unused := [f"{d.id} {d.category}" for d in detections if d.id not in used]:
@@ -149,6 +149,6 @@ def _check_frames(parts: Parts, people: PeopleFile, bodies: Bodies | None) -> No
         return
     expected = f"a frame from 0 to {count - 1}, as frames/ has {count}"
     if bodies is not None and parts.bodies is not None and bodies.frame.max() >= count:
-        refuse(get(parts.bodies, "frame"), expected, f"{int(bodies.frame.max())}")
+        parts.bodies.get("frame").refuse(expected, f"{int(bodies.frame.max())}")
     if people.frames and parts.people is not None and max(people.frames) >= count:
-        refuse(get(parts.people, "images"), expected, f"{max(people.frames)}")
+        parts.people.get("images").refuse(expected, f"{max(people.frames)}")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mover.core.types import STILL, Bodies, Camera, CameraPath
 from mover.geometry.camera import heading, pitch_roll
 from mover.geometry.rotations import affine, rot_y
-from mover.io.files.fields import LAST_INDEX, At, Warn, array, get, maybe, plain, refuse
+from mover.io.files.fields import LAST_INDEX, At, Warn, plain
 from mover.io.files.schema import Number, Positive, Rows, Share, Side, checked, rotation
 
 LARGEST_AREA = 1 << 28  # [px²]
@@ -50,14 +50,14 @@ def camera_of(at: At, other: Camera | None = None) -> Camera:
     lens = checked(at, CameraFields)
     if lens.w * lens.h > LARGEST_AREA:
         found = f"{lens.w} x {lens.h}"
-        refuse(get(at, "w"), f"an image of at most {LARGEST_AREA} pixels", found)
+        at.get("w").refuse(f"an image of at most {LARGEST_AREA} pixels", found)
     for key in DISTORTION:
-        given = maybe(at, key)
+        given = at.maybe(key)
         if given is not None and checked(given, Number) != 0:
-            refuse(given, "an image without distortion (0): undistort the images first")
+            given.refuse("an image without distortion (0): undistort the images first")
     K = torch.tensor([[lens.fl_x, 0.0, lens.cx], [0.0, lens.fl_y, lens.cy], [0.0, 0.0, 1.0]])
     if lens.R_cam_world is not None:
-        turn = torch.from_numpy(rotation(get(at, "R_cam_world")).astype(np.float32))
+        turn = torch.from_numpy(rotation(at.get("R_cam_world")).astype(np.float32))
     else:
         turn = LEVEL if other is None else other.R_cam_world
     return Camera(K, turn, lens.w, lens.h)
@@ -114,21 +114,21 @@ def path_of(at: At, camera: Camera, bodies: Bodies | None, warn: Warn) -> Camera
     Raises:
         InputError: If a field is wrong, a body's frame lies outside, or the lens zooms.
     """
-    frame = array(get(at, "frame"), ("N",), "whole")
+    frame = at.get("frame").array(("N",), "whole")
     if not len(frame) or (np.diff(frame) <= 0).any() or frame[0] < 0 or frame[-1] > LAST_INDEX:
-        refuse(get(at, "frame"), f"rising frames from 0 to {LAST_INDEX}")
-    T = _poses(get(at, "T_world_camera"), len(frame))
+        at.get("frame").refuse(f"rising frames from 0 to {LAST_INDEX}")
+    T = _poses(at.get("T_world_camera"), len(frame))
     _check_lens(at, len(frame), camera, warn)
-    given, first = maybe(at, "reference"), 0
+    given, first = at.maybe("reference"), 0
     if given is not None:
-        number = int(array(given, (), "whole"))
+        number = int(given.array((), "whole"))
         if number not in frame:
-            refuse(given, "a frame that has a pose", f"{number}")
+            given.refuse("a frame that has a pose", f"{number}")
         first = int(np.flatnonzero(frame == number)[0])
     for end in () if bodies is None else (int(bodies.frame.min()), int(bodies.frame.max())):
         if not frame[0] <= end <= frame[-1]:
             reach = f"frames {frame[0]} to {frame[-1]}"
-            refuse(get(at, "frame"), f"poses for all bodies, also for frame {end}", reach)
+            at.get("frame").refuse(f"poses for all bodies, also for frame {end}", reach)
     relative = np.linalg.inv(T[first]) @ T
     if np.abs(relative - np.eye(4)).max() < STILL_POSES:
         return STILL
@@ -140,26 +140,26 @@ def path_of(at: At, camera: Camera, bodies: Bodies | None, warn: Warn) -> Camera
 
 def _poses(at: At, count: int) -> NDArray[np.float64]:
     """Rigid poses, exactly so."""
-    T = array(at, (count, 4, 4)).astype(np.float64)
+    T = at.array((count, 4, 4)).astype(np.float64)
     u, size, v = np.linalg.svd(T[:, :3, :3])
     bad = (np.abs(size - 1) > RIGID).any(1) | (np.linalg.det(T[:, :3, :3]) < 0)
     bad |= np.abs(T[:, 3] - [0, 0, 0, 1]).max(1) > RIGID
     if bad.any():
         which = int(np.argmax(bad))
-        refuse(at, "poses of rotation and translation, last row 0 0 0 1", f"another at [{which}]")
+        at.refuse("poses of rotation and translation, last row 0 0 0 1", f"another at [{which}]")
     T[:, :3, :3], T[:, 3] = u @ v, [0, 0, 0, 1]
     return T
 
 
 def _check_lens(at: At, count: int, camera: Camera, warn: Warn) -> None:
     """One lens sees all frames and the reference image."""
-    given = maybe(at, "focal")
+    given = at.maybe("focal")
     if given is None:
         return
-    focal = array(given, (count,)).astype(np.float64)
+    focal = given.array((count,)).astype(np.float64)
     if focal.min() <= 0 or focal.max() / focal.min() > 1 + ZOOM:
         found = f"{focal.min():.3g} to {focal.max():.3g}"
-        refuse(given, "one focal length above 0 for all frames (no zoom)", found)
+        given.refuse("one focal length above 0 for all frames (no zoom)", found)
     own, usual = float(camera.K[0, 0]) / camera.width, float(np.median(focal))
     if abs(usual / own - 1) > ZOOM:
         warn(

@@ -18,7 +18,7 @@ from mover.core.errors import InputError
 from mover.core.types import Capture, Scene, SceneObject
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import pitch_roll, tilted, to_camera, to_world
-from mover.io.files.fields import At, get, items, mapping, plain, read_json, write_json
+from mover.io.files.fields import plain, read_json, write_json
 from mover.io.files.schema import Number, Sizes, Vector, checked
 
 
@@ -155,12 +155,12 @@ def read_edits(path: Path) -> tuple[Edit, ...]:
     """Read and check a list of edits; whether their objects exist is checked when they apply."""
     at, found = read_json(path), list[Edit]()
     checked(at, EditsFields)
-    for item in items(get(at, "edits")):
-        row = mapping(item)
+    for item in at.get("edits").items():
+        row = item.mapping()
         if row.get("do") == "place":  # its row has the fields of the placement
             checked(item, Placement)
             row = {**row, "at": row}
-        found.append(checked(At(row, item.file, item.field), Edit))
+        found.append(checked(item.holding(row), Edit))
     return tuple(found)
 
 

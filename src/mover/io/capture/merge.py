@@ -24,7 +24,7 @@ from mover.io.capture.pairing import linked, named_rows, pair_rows
 from mover.io.capture.parts import UNKNOWN, Parts
 from mover.io.capture.pose_file import joined_bodies
 from mover.io.capture.tracks import numbers_beside, renumbered
-from mover.io.files.fields import At, get, items, listed, maybe, refuse, write_json
+from mover.io.files.fields import At, listed, write_json
 from mover.io.files.images import write_image
 from mover.io.files.npz import write_npz
 from mover.io.masks.coco import annotations_tree
@@ -118,7 +118,7 @@ def _bodies(old: At | None, new: At | None) -> tuple[At | None, tuple[str, ...]]
     if fingerprint(first) == fingerprint(second):
         return old, ()
     if first.space != second.space:
-        refuse(get(new, "space"), f"{first.space!r}, as the bodies that are there")
+        new.get("space").refuse(f"{first.space!r}, as the bodies that are there")
     numbers, same = numbers_beside(first, second)
     second = replace(second, person=renumbered(second.person, numbers))
     notes = [f"{new.file}: its person {a} is person {b} here" for a, b in numbers.items() if a != b]
@@ -162,8 +162,8 @@ def _objects(old: Parts, new: Parts) -> At | None:
         return new.objects or old.objects
 
     def used(scene: At | None) -> set[int]:
-        rows = [] if scene is None else items(get(scene, "objects"))
-        return {key.value for row in rows if (key := maybe(row, "annotation")) is not None}
+        rows = [] if scene is None else scene.get("objects").items()
+        return {key.value for row in rows if (key := row.maybe("annotation")) is not None}
 
     newer = new.scene is None or not used(new.scene)  # the ids are those of the older file
     first, second = (old.objects, new.objects) if newer else (new.objects, old.objects)
@@ -185,7 +185,7 @@ def _objects(old: Parts, new: Parts) -> At | None:
     free = max((row["id"] for row in ours), default=-1) + 1
     others = [row for j, row in enumerate(theirs) if j not in set(pairs.values())]
     rows += [{**row, "id": free + k} for k, row in enumerate(others)]
-    return At(annotations_tree(rows, items(get(first, "images"))[0].value), first.file)
+    return At(annotations_tree(rows, first.get("images").items()[0].value), first.file)
 
 
 def _capture(whole: Parts) -> Capture | None:
@@ -227,8 +227,8 @@ def _camera_of(whole: Parts) -> Camera | None:
         return camera_of(whole.camera)
     size = whole.image_size
     for tree in (whole.objects, whole.people):
-        for image in [] if tree is None else items(get(tree, "images"))[:1]:
-            w, h = maybe(image, "width"), maybe(image, "height")
+        for image in [] if tree is None else tree.get("images").items()[:1]:
+            w, h = image.maybe("width"), image.maybe("height")
             if size is None and w is not None and h is not None:
                 size = w.value, h.value
     if size is None or whole.scene is not None:
@@ -239,8 +239,8 @@ def _camera_of(whole: Parts) -> Camera | None:
 
 def _missing(whole: Parts) -> tuple[str, ...]:
     """What is not there, each with its consequence."""
-    rows = [] if whole.objects is None else items(get(whole.objects, "annotations"))
-    masked = any(maybe(row, "segmentation") for row in rows)
+    rows = [] if whole.objects is None else whole.objects.get("annotations").items()
+    masked = any(row.maybe("segmentation") for row in rows)
     lacking = {
         "camera.json: the lens (--camera FILE, or --fov DEGREES with --image)": not whole.camera,
         "scene.json and meshes/: a first guess of the furniture (any of the scene formats)":

@@ -16,7 +16,7 @@ from mover.io.capture.agreement import (
     pairwise_iou2d,
 )
 from mover.io.capture.parts import UNKNOWN
-from mover.io.files.fields import At, get, items
+from mover.io.files.fields import At
 
 LEAST = 0.1  # boxes of one class that share less are not of one thing
 OTHER_CLASS = 0.5  # the same, of different classes
@@ -26,10 +26,10 @@ Row = Mapping[str, Any]
 
 def named_rows(at: At) -> list[dict[str, Any]]:
     """The annotations of objects.json with the names of their categories instead of ids."""
-    names = {c.value["id"]: str(c.value["name"]) for c in items(get(at, "categories"))}
+    names = {c.value["id"]: str(c.value["name"]) for c in at.get("categories").items()}
     return [
         {**item.value, "category_id": names[item.value["category_id"]]}
-        for item in items(get(at, "annotations"))
+        for item in at.get("annotations").items()
     ]
 
 

@@ -16,7 +16,7 @@ from mover.core.files import reason
 from mover.core.records import rows_of
 from mover.core.types import Bodies, BodyPose
 from mover.geometry.rotations import axis_angle, rotation_vectors
-from mover.io.files.fields import At, array, choice, get, maybe, refuse
+from mover.io.files.fields import At
 from mover.io.people.values import vectors
 
 NEEDED = ("betas", "global_orient", "body_pose", "transl")
@@ -34,34 +34,34 @@ UNUSABLE = (InputError, ValueError, RuntimeError, KeyError, OSError)
 
 def pose_of(at: At, rows: int) -> BodyPose | None:
     """The parameters among the arrays of a file, None if it has none."""
-    if all(maybe(at, key) is None for key in ("model", *NEEDED, *EXTRA)):
+    if all(at.maybe(key) is None for key in ("model", *NEEDED, *EXTRA)):
         return None
 
     def word(field: At, choices: tuple[str, ...]) -> str:
-        return choice(At(str(array(field, (), "text")), field.file, field.field), choices)
+        return field.holding(str(field.array((), "text"))).choice(choices)
 
     def values(field: At, *shape: int | str) -> Tensor:
-        return torch.from_numpy(array(field, shape).astype(np.float32))
+        return torch.from_numpy(field.array(shape).astype(np.float32))
 
-    model, gender = word(get(at, "model"), MODELS), maybe(at, "gender")
-    angles = values(get(at, "body_pose"), rows, "63 or 69")
+    model, gender = word(at.get("model"), MODELS), at.maybe("gender")
+    angles = values(at.get("body_pose"), rows, "63 or 69")
     if angles.shape[1] not in ANGLES:
         found = f"{angles.shape[1]}"
-        refuse(get(at, "body_pose"), f"{ANGLES[0]} or {ANGLES[1]} angles a row", found)
+        at.get("body_pose").refuse(f"{ANGLES[0]} or {ANGLES[1]} angles a row", found)
     extra: dict[str, Tensor] = {}
     for key in EXTRA:  # values for each row; the axes behind the first are joined
-        if (field := maybe(at, key)) is not None:
+        if (field := at.maybe(key)) is not None:
             axes = max(np.ndim(field.value) - 1, 1)
             extra[key] = values(field, rows, *("N" * axes)).flatten(1)
-    betas = get(at, "betas")  # of one person or of each row
+    betas = at.get("betas")  # of one person or of each row
     wide = ("S",) if isinstance(betas.value, np.ndarray) and betas.value.ndim == 1 else (rows, "S")
     return BodyPose(
         model=model,
         gender="neutral" if gender is None else word(gender, GENDERS),
         betas=values(betas, *wide).expand(rows, -1).clone(),
-        global_orient=values(get(at, "global_orient"), rows, 3),
+        global_orient=values(at.get("global_orient"), rows, 3),
         body_pose=angles,
-        transl=values(get(at, "transl"), rows, 3),
+        transl=values(at.get("transl"), rows, 3),
         extra=extra,
     )
 
@@ -84,9 +84,7 @@ def posed(
         verts, joints = run_model(model, pose)
     except UNUSABLE as error:
         message = f"{str(pose.model)!r}, which gives no meshes ({reason(error)})"
-        refuse(
-            get(at, "model"), "a body model that can be posed, or 'vertices' and 'faces'", message
-        )
+        at.get("model").refuse("a body model that can be posed, or 'vertices' and 'faces'", message)
     return verts, model.faces, joints, model.joint_names
 
 

@@ -17,18 +17,7 @@ from mover.core.types import Camera, Scene, SceneObject, Segment
 from mover.geometry.rotations import rot_y, wrap
 from mover.io.capture.camera_file import camera_of, camera_to_json, check_attitude, turned
 from mover.io.capture.parts import LoadMesh
-from mover.io.files.fields import (
-    At,
-    Warn,
-    get,
-    items,
-    listed,
-    plain,
-    read_json,
-    refuse,
-    unique,
-    write_json,
-)
+from mover.io.files.fields import At, Warn, listed, plain, read_json, unique, write_json
 from mover.io.files.meshes import copy_mesh, read_mesh, stretch_file, write_mesh
 from mover.io.files.schema import Id, Index, Number, Share, Sizes, Text, Vector, checked
 
@@ -111,13 +100,13 @@ def scene_of(at: At, load: LoadMesh, camera: Camera | None, warn: Warn) -> tuple
     """
     fields = checked(at, SceneFields)
     if fields.camera is not None:
-        camera = camera_of(get(at, "camera"), camera)
+        camera = camera_of(at.get("camera"), camera)
     if camera is None:
-        refuse(get(at, "camera"), "a camera, here or in camera.json")
+        at.get("camera").refuse("a camera, here or in camera.json")
     ground = None if fields.ground is None else fields.ground.height
     if ground is not None and ground >= 0:
         warn(f"{at.file}: the ground is not below the camera (height {ground:g} m)")
-    objects = _objects_of(get(at, "objects"), fields.objects, load)
+    objects = _objects_of(at.get("objects"), fields.objects, load)
     camera, angle = turned(camera)
     check_attitude(camera, at.file, warn)
     objects = tuple(_turn(one, angle) for one in objects) if angle else tuple(objects)
@@ -128,18 +117,18 @@ def _objects_of(at: At, rows: Sequence[ObjectFields], load: LoadMesh) -> list[Sc
     """All objects of a scene, with their relations checked."""
     ids, annotations = set[object](), set[object]()
     objects: list[SceneObject] = []
-    for item, row in zip(items(at), rows, strict=True):
-        check_id(get(item, "id"))
-        unique(get(item, "id"), ids, row.id.casefold(), "an id (in any case)")
+    for item, row in zip(at.items(), rows, strict=True):
+        check_id(item.get("id"))
+        unique(item.get("id"), ids, row.id.casefold(), "an id (in any case)")
         if row.annotation is not None:
-            unique(get(item, "annotation"), annotations, row.annotation, "an annotation")
+            unique(item.get("annotation"), annotations, row.annotation, "an annotation")
         segments = [Segment(one.frame, torch.tensor(one.translation), torch.tensor(one.yaw),
                             one.mover) for one in row.segments or ()]  # fmt: skip
         for k, (before, after) in enumerate(pairwise(one.frame for one in segments), 1):
             if after <= before:
                 field = At(after, at.file, f"{item.field}.segments[{k}].frame")
-                refuse(field, f"a frame after {before}, in which the segment before begins")
-        mesh, file = load(get(item, "mesh"))
+                field.refuse(f"a frame after {before}, in which the segment before begins")
+        mesh, file = load(item.get("mesh"))
         support = "ground" if row.support is None else str(row.support)
         objects.append(
             SceneObject(str(row.id), str(row.category), mesh, file, row.annotation, support,
@@ -153,9 +142,9 @@ def check_id(at: At) -> None:
     """Refuse an id that is not safe as the name of a file, or means something else."""
     name = at.value
     if not SAFE_ID.fullmatch(name) or name.casefold() in WORDS or name.endswith("."):
-        refuse(at, "letters, digits, '_', '-' or '.', not 'ground' or 'free'")
+        at.refuse("letters, digits, '_', '-' or '.', not 'ground' or 'free'")
     if len(name.encode()) > LONGEST_ID:  # with endings, a file's name has 255 bytes at most
-        refuse(at, f"at most {LONGEST_ID} bytes", f"{len(name.encode())}")
+        at.refuse(f"at most {LONGEST_ID} bytes", f"{len(name.encode())}")
 
 
 def _check_supports(at: At, objects: list[SceneObject]) -> None:
@@ -166,9 +155,9 @@ def _check_supports(at: At, objects: list[SceneObject]) -> None:
         below, visited = one.support, {one.id}
         while below not in WORDS:
             if below not in under:
-                refuse(field, "'ground', 'free' or the id of an object", f"{below!r}")
+                field.refuse("'ground', 'free' or the id of an object", f"{below!r}")
             if below in visited:
-                refuse(field, "supports that end at the ground", "a circle of supports")
+                field.refuse("supports that end at the ground", "a circle of supports")
             visited.add(below)
             below = under[below]
 
@@ -259,7 +248,7 @@ def hypotheses_of(at: At, load: LoadMesh, scene: Scene, warn: Warn) -> tuple[Sce
     The first row of each object is the one that the scene has. Where it is not, the scene came
     from elsewhere or was changed since, and the object's rows are left out with a warning.
     """
-    objects, own = get(at, "objects"), {one.id: one for one in scene.objects}
+    objects, own = at.get("objects"), {one.id: one for one in scene.objects}
     found: list[SceneObject] = []
     stale: list[str] = []
     for name, rows in checked(at, HypothesesFields).objects.items():
@@ -271,8 +260,8 @@ def hypotheses_of(at: At, load: LoadMesh, scene: Scene, warn: Warn) -> tuple[Sce
         if first is None or not near:
             stale.append(name)
             continue
-        for row, place in zip(rows[1:], items(get(objects, name))[1:], strict=True):
-            mesh, file = load(get(place, "mesh"))
+        for row, place in zip(rows[1:], objects.get(name).items()[1:], strict=True):
+            mesh, file = load(place.get("mesh"))
             found.append(replace(first, mesh=mesh, mesh_file=file, **row.tensors()))
     if stale:
         warn(f"{at.file}: not of this scene, so not used: {listed('object', stale)}")

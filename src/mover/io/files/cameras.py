@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mover.core.errors import InputError
 from mover.core.files import unreadable
 from mover.geometry.camera import tilted
-from mover.io.files.fields import LARGEST, At, maybe, number, read_json, refuse
+from mover.io.files.fields import LARGEST, At, read_json
 from mover.io.files.schema import Positive, Side, checked
 
 log = logging.getLogger(__name__)
@@ -84,8 +84,8 @@ def read_camera_file(path: Path, size: Size) -> At:
             return camera_of_tree(read_json(path), size)
         case ".xml" | ".yml" | ".yaml":
             tree = _of_text(path)
-            if maybe(tree, *MATRIX) is None:
-                refuse(tree, f"a matrix of the camera ({', '.join(MATRIX)})", "none")
+            if tree.maybe(*MATRIX) is None:
+                tree.refuse(f"a matrix of the camera ({', '.join(MATRIX)})", "none")
             return camera_of_tree(tree, size)
         case _:
             if rows := _colmap_rows(path):
@@ -95,19 +95,19 @@ def read_camera_file(path: Path, size: Size) -> At:
 
 def camera_of_tree(at: At, size: Size) -> At:
     """The fields of camera.json from a mapping of any known kind."""
-    if maybe(at, "fl_x") is not None:
+    if at.maybe("fl_x") is not None:
         return At({"w": size[0], "h": size[1], **at.value} if size else at.value, at.file)
-    if (given := maybe(at, *MATRIX)) is not None:
+    if (given := at.maybe(*MATRIX)) is not None:
         return _of_matrix(_checked(_numbers(given), given), size, at)
     found = [(way, one) for way, one in _objects(at) if {"fx", "fy"} <= one.value.keys()]
     if not found:
         return _of_lens(at, size)
     # Of several, the colour camera's.
     one = next((one for way, one in found if re.search("colou?r|rgb", way, re.I)), found[0][1])
-    four = [maybe(one, *names) for names in FOUR]
+    four = [one.maybe(*names) for names in FOUR]
     if None in four:
-        refuse(one, "a lens with fx, fy, ppx, ppy or cx, cy")
-    lens = At([n.value for n in four if n], one.file, one.field)
+        one.refuse("a lens with fx, fy, ppx, ppy or cx, cy")
+    lens = one.holding([n.value for n in four if n])
     return _of_matrix(_checked(_numbers(lens), lens), size, one)
 
 
@@ -123,7 +123,7 @@ def _numbers(at: At) -> NDArray[np.float64]:
     """The numbers of lists in lists, or of OpenCV's {"data": [...]}, one after another."""
     value: Any = at.value.get("data") if isinstance(at.value, Mapping) else at.value
     flat = np.array(value, dtype=object).ravel()
-    return np.array([number(At(one, at.file, at.field)) for one in flat])
+    return np.array([at.holding(one).number() for one in flat])
 
 
 def _of_matrix(K: NDArray[np.float64], size: Size, at: At, shift: float = HALF) -> At:
@@ -135,19 +135,19 @@ def _of_matrix(K: NDArray[np.float64], size: Size, at: At, shift: float = HALF) 
         at: The mapping in which the matrix stands.
         shift: Of the centre of the first pixel [px].
     """
-    sides = [maybe(at, *names) for names in SIDES]
+    sides = [at.maybe(*names) for names in SIDES]
     if size is None and None not in sides:
-        w, h = (checked(At(int(_numbers(s)[0]), s.file, s.field), Side) for s in sides if s)
+        w, h = (checked(s.holding(int(_numbers(s)[0])), Side) for s in sides if s)
         size = w, h
-    if (bent := maybe(at, *BENT)) is not None:
+    if (bent := at.maybe(*BENT)) is not None:
         _check_straight(_numbers(bent), K, size, bent)
     fx, fy, cx, cy = (K[i, j].item() for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     found = _lens(at, size, fx, fy, (cx + shift, cy + shift))
-    if (seen := maybe(at, "CameraMatrix")) is None:
+    if (seen := at.maybe("CameraMatrix")) is None:
         return found
     R = _numbers(seen)  # of the authors of MOVER: [R | t] of a world that is y-down
     if R.size != 12:
-        refuse(seen, "3 x 4 numbers", f"{R.size}")
+        seen.refuse("3 x 4 numbers", f"{R.size}")
     turn = (R.reshape(3, 4)[:, :3] @ np.diag([1.0, -1.0, -1.0])).tolist()
     return At({**found.value, "R_cam_world": turn}, found.file)
 
@@ -162,7 +162,7 @@ def _check_straight(bent: NDArray[np.float64], K: NDArray[np.float64], size: Siz
     moved = abs(k1 * r**3 + k2 * r**5 + k3 * r**7) + 3 * (abs(p1) + abs(p2)) * r**2
     if moved * K[0, 0] > STRAIGHT or bent[5:].any():
         far = f"a distortion that moves the corners by {moved * K[0, 0]:.3g} px"
-        refuse(at, "a straight lens: undistort the images first", far)
+        at.refuse("a straight lens: undistort the images first", far)
     log.warning("%s: its distortion (%.2g px at the corners) is left out", at.file, moved * K[0, 0])
 
 
@@ -171,7 +171,7 @@ def _lens(
 ) -> At:
     """The fields of camera.json; without a centre, the principal point is the image's middle."""
     if size is None:
-        refuse(at, "the size of the image beside it: give --image", "no width and height")
+        at.refuse("the size of the image beside it: give --image", "no width and height")
     (w, h), (cx, cy) = size, centre or (size[0] / 2, size[1] / 2)
     return At({"w": w, "h": h, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}, at.file)
 
@@ -183,7 +183,7 @@ def of_view(degrees: float, size: tuple[int, int], file: str) -> At:
 
 def with_spread(at: At, spread: float) -> At:
     """The fields of camera.json with how far off the focal length may be, of its logarithm."""
-    return At({**at.value, "focal_spread": spread}, at.file, at.field)
+    return at.holding({**at.value, "focal_spread": spread})
 
 
 def guessed_view(degrees: float, size: tuple[int, int]) -> At:
@@ -212,27 +212,27 @@ def _checked(values: NDArray[np.float64], at: At) -> NDArray[np.float64]:
     K = given.T if turned else given
     usual = [K[0, 1], K[1, 0], *K[2]] == [0, 0, 0, 0, 1] and K[0, 0] > 0 and K[1, 1] > 0
     if not usual or not np.abs(K).max() <= LARGEST:
-        refuse(at, "3 x 3 numbers, intrinsics [fx 0 cx; 0 fy cy; 0 0 1]")
+        at.refuse("3 x 3 numbers, intrinsics [fx 0 cx; 0 fy cy; 0 0 1]")
     return K
 
 
 def _of_lens(at: At, size: Size) -> At:
     """A camera from a focal length or a field of view, with its tilt where the file has it."""
-    pitch, roll = maybe(at, "pitch"), maybe(at, "roll")
-    focal, across, up = maybe(at, *FOCAL), maybe(at, "fov_x"), maybe(at, "fov_y")
+    pitch, roll = at.maybe("pitch"), at.maybe("roll")
+    focal, across, up = at.maybe(*FOCAL), at.maybe("fov_x"), at.maybe("fov_y")
     tilt: dict[str, Any] = {}
     if pitch is not None and roll is not None:  # diag(1, -1, -1) R_z(roll) R_x(-pitch)
-        angles = [number(pitch, -1.6, 1.6), number(roll, -1.6, 1.6)]
+        angles = [pitch.number(-1.6, 1.6), roll.number(-1.6, 1.6)]
         tilt["R_cam_world"] = tilted(*torch.tensor(angles, dtype=torch.float64)).tolist()
     fx = 0.0 if focal is None else checked(focal, Positive)
     lens = _lens(at, size, fx, fx).value if focal or across else {}
     if across is not None and focal is None:
         views = ("fl_x", "w", across), ("fl_y", "h", up) if up else ("fl_y", "w", across)
         for name, side, view in views:
-            lens[name] = lens[side] / 2 / math.tan(math.radians(number(view, 1, WIDEST)) / 2)
+            lens[name] = lens[side] / 2 / math.tan(math.radians(view.number(1, WIDEST)) / 2)
     elif focal is None:
         known = f"fl_x, fx, {', '.join(MATRIX)}, {', '.join(FOCAL[:2])} or fov_x"
-        refuse(at, f"a camera with one of the fields {known}")
+        at.refuse(f"a camera with one of the fields {known}")
     return At({**lens, **tilt}, at.file)
 
 
@@ -267,7 +267,7 @@ def _of_text(path: Path) -> At:
             found[name] = [float(word) for word in words]
         except ValueError:
             if name in (*MATRIX, *BENT):
-                refuse(At(" ".join(words), path.name, name), "numbers")
+                At(" ".join(words), path.name, name).refuse("numbers")
     if not found:
         raise unreadable(path, "it has no numbers with names", "OpenCV's calibration")
     return At(found, path.name)
@@ -304,12 +304,12 @@ def _of_colmap(rows: list[list[str]], file: str) -> At:
     try:
         w, h, *values = (float(word) for word in rest)
     except ValueError:
-        refuse(at, "numbers")
+        at.refuse("numbers")
     if len(values) != COLMAP[model]:
-        refuse(at, f"{COLMAP[model]} numbers", f"{len(values)}")
+        at.refuse(f"{COLMAP[model]} numbers", f"{len(values)}")
     if "FISHEYE" in model or model == "FOV":
         cure = "a straight lens: undistort the images (colmap image_undistorter)"
-        refuse(at, cure, "a fisheye's")
+        at.refuse(cure, "a fisheye's")
     fx, fy, cx, cy, *bent = values[:1] * (model in ONE_FOCAL) + values
     K, size = _checked(np.array([fx, fy, cx, cy]), at), (int(w), int(h))
     return _of_matrix(K, size, At({"coeffs": bent}, file, model), shift=0.0)

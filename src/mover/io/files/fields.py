@@ -33,7 +33,7 @@ MISSING = Missing()
 
 @dataclass(frozen=True)
 class At:
-    """A value of the user and where it stands."""
+    """A value of the user and where it stands; what is asked of it is checked."""
 
     value: Any
     file: str
@@ -44,10 +44,94 @@ class At:
         """How an error message calls it."""
         return f"{self.file}: field '{self.field}'" if self.field else self.file
 
+    def refuse(self, expected: str, found: str | None = None) -> NoReturn:
+        """Raise the error that names file, field, found and expected."""
+        raise InputError(f"{self.place} has {found or shown(self.value)}, expected {expected}")
 
-def refuse(at: At, expected: str, found: str | None = None) -> NoReturn:
-    """Raise the error that names file, field, found and expected."""
-    raise InputError(f"{at.place} has {found or shown(at.value)}, expected {expected}")
+    def holding(self, value: Any) -> "At":  # noqa: ANN401
+        """Another value in the same place."""
+        return At(value, self.file, self.field)
+
+    def get(self, key: str) -> "At":
+        """The field `key` of a mapping; its value is MISSING where it has none."""
+        value = self.mapping().get(key, MISSING)
+        return At(value, self.file, f"{self.field}.{key}" if self.field else key)
+
+    def maybe(self, *keys: str) -> "At | None":
+        """The first of several names of a field that is there and not null, None without."""
+        given = self.mapping()
+        return next((self.get(key) for key in keys if given.get(key) is not None), None)
+
+    def mapping(self) -> Mapping[str, Any]:
+        """A JSON object."""
+        if not isinstance(self.value, Mapping):
+            self.refuse("an object {...}")
+        return self.value
+
+    def items(self, count: int | None = None) -> "list[At]":
+        """The items of a list, of `count` of them if given."""
+        expected = "a list" if count is None else f"a list of {count}"
+        if not isinstance(self.value, list | tuple):
+            self.refuse(expected)
+        if count is not None and len(self.value) != count:
+            self.refuse(expected, f"{len(self.value)} items")
+        return [At(v, self.file, f"{self.field}[{i}]") for i, v in enumerate(self.value)]
+
+    def text(self) -> str:
+        """Printable text that is not blank."""
+        value = self.value
+        if not isinstance(value, str) or not value.strip() or not value.isprintable():
+            self.refuse("printable text")
+        return value
+
+    def choice(self, choices: tuple[str, ...]) -> str:
+        """One of `choices`."""
+        if not isinstance(self.value, str) or self.value not in choices:
+            self.refuse("one of " + ", ".join(choices))
+        return self.value
+
+    def number(self, low: float = -LARGEST, high: float = LARGEST) -> float:
+        """A finite number between the bounds."""
+        bounds = "" if (low, high) == (-LARGEST, LARGEST) else f" from {low:g} to {high:g}"
+        value = self.value
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not is_number or not low <= value <= high:  # false for NaN as well
+            self.refuse(f"a finite number{bounds}")
+        return float(value)
+
+    def integer(self, low: int = 0, high: int = LAST_INDEX) -> int:
+        """A whole number between the bounds."""
+        value = self.value
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+            self.refuse(f"a whole number from {low} to {high}")
+        return value
+
+    def vector(self, count: int) -> list[float]:
+        """A list of `count` finite numbers."""
+        return [item.number() for item in self.items(count)]
+
+    def array(
+        self, shape: tuple[int | str, ...], kind: Literal["real", "whole", "text"] = "real"
+    ) -> NDArray[Any]:
+        """An array of this shape, where a letter stands for any size, with finite values."""
+        value = self.value
+        wanted = f"{kind} numbers" if kind != "text" else "text"
+        expected = f"an array of {wanted} of shape ({', '.join(map(str, shape))})"
+        if not isinstance(value, np.ndarray) or value.dtype.kind not in _KINDS[kind]:
+            self.refuse(expected)
+        fits = all(isinstance(n, str) or n == m for n, m in zip(shape, value.shape, strict=False))
+        if value.ndim != len(shape) or not fits:
+            self.refuse(expected)
+        if kind == "real":
+            with np.errstate(invalid="ignore"):
+                bad = ~(np.abs(value.astype(np.float64, copy=False)) <= LARGEST)
+            if bad.any():
+                first = tuple(int(i) for i in np.argwhere(bad)[0])
+                self.refuse("finite numbers", f"{value[first]} at {list(first)}")
+        return value
+
+
+_KINDS = {"real": "fiu", "whole": "iu", "text": "U"}
 
 
 def shown(value: Any) -> str:  # noqa: ANN401
@@ -68,101 +152,11 @@ def listed(what: str, names: Sequence[object]) -> str:
     return f"{what} {some}" if len(names) == 1 else f"{len(names)} {what}s ({some})"
 
 
-def get(at: At, key: str) -> At:
-    """The field `key` of a mapping; its value is MISSING where it has none."""
-    value = mapping(at).get(key, MISSING)
-    return At(value, at.file, f"{at.field}.{key}" if at.field else key)
-
-
-def maybe(at: At, *keys: str) -> At | None:
-    """The first of several names of a field that is there and not null, None without."""
-    given = mapping(at)
-    return next((get(at, key) for key in keys if given.get(key) is not None), None)
-
-
-def mapping(at: At) -> Mapping[str, Any]:
-    """A JSON object."""
-    if not isinstance(at.value, Mapping):
-        refuse(at, "an object {...}")
-    return at.value
-
-
-def items(at: At, count: int | None = None) -> list[At]:
-    """The items of a list, of `count` of them if given."""
-    expected = "a list" if count is None else f"a list of {count}"
-    if not isinstance(at.value, list | tuple):
-        refuse(at, expected)
-    if count is not None and len(at.value) != count:
-        refuse(at, expected, f"{len(at.value)} items")
-    return [At(v, at.file, f"{at.field}[{i}]") for i, v in enumerate(at.value)]
-
-
-def text(at: At) -> str:
-    """Printable text that is not blank."""
-    if not isinstance(at.value, str) or not at.value.strip() or not at.value.isprintable():
-        refuse(at, "printable text")
-    return at.value
-
-
-def choice(at: At, choices: tuple[str, ...]) -> str:
-    """One of `choices`."""
-    if not isinstance(at.value, str) or at.value not in choices:
-        refuse(at, "one of " + ", ".join(choices))
-    return at.value
-
-
-def number(at: At, low: float = -LARGEST, high: float = LARGEST) -> float:
-    """A finite number between the bounds."""
-    bounds = "" if (low, high) == (-LARGEST, LARGEST) else f" from {low:g} to {high:g}"
-    value = at.value
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not is_number or not low <= value <= high:  # false for NaN as well
-        refuse(at, f"a finite number{bounds}")
-    return float(value)
-
-
-def integer(at: At, low: int = 0, high: int = LAST_INDEX) -> int:
-    """A whole number between the bounds."""
-    value = at.value
-    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-        refuse(at, f"a whole number from {low} to {high}")
-    return value
-
-
-def vector(at: At, count: int) -> list[float]:
-    """A list of `count` finite numbers."""
-    return [number(item) for item in items(at, count)]
-
-
 def unique(at: At, seen: set[Any], key: object, what: str) -> None:
     """Refuse a key that was seen before, and remember it."""
     if key in seen:
-        refuse(at, f"{what} that is not used twice")
+        at.refuse(f"{what} that is not used twice")
     seen.add(key)
-
-
-def array(
-    at: At, shape: tuple[int | str, ...], kind: Literal["real", "whole", "text"] = "real"
-) -> NDArray[Any]:
-    """An array of this shape, where a letter stands for any size, with finite values."""
-    value = at.value
-    wanted = f"{kind} numbers" if kind != "text" else "text"
-    expected = f"an array of {wanted} of shape ({', '.join(map(str, shape))})"
-    if not isinstance(value, np.ndarray) or value.dtype.kind not in _KINDS[kind]:
-        refuse(at, expected)
-    fits = all(isinstance(n, str) or n == m for n, m in zip(shape, value.shape, strict=False))
-    if value.ndim != len(shape) or not fits:
-        refuse(at, expected)
-    if kind == "real":
-        with np.errstate(invalid="ignore"):
-            bad = ~(np.abs(value.astype(np.float64, copy=False)) <= LARGEST)
-        if bad.any():
-            first = tuple(int(i) for i in np.argwhere(bad)[0])
-            refuse(at, "finite numbers", f"{value[first]} at {list(first)}")
-    return value
-
-
-_KINDS = {"real": "fiu", "whole": "iu", "text": "U"}
 
 
 def existing(path: Path, expected: str = "") -> Path:

@@ -16,7 +16,7 @@ from torch import Tensor
 from mover.core.errors import InputError
 from mover.core.files import reason, replacing, unreadable
 from mover.core.types import Camera, DepthImage
-from mover.io.files.fields import At, array, maybe, refuse
+from mover.io.files.fields import At
 from mover.io.files.meshes import inside
 from mover.io.files.npz import read_npy, read_npz
 
@@ -48,7 +48,7 @@ def opened(
         Image.DecompressionBombWarning,
     ) as error:  # fmt: skip
         if at is not None:
-            refuse(at, expected, f"{str(at.value)!r}, which cannot be read ({reason(error, path)})")
+            at.refuse(expected, f"{str(at.value)!r}, which cannot be read ({reason(error, path)})")
         raise unreadable(path, error, expected) from error
 
 
@@ -74,7 +74,7 @@ def read_image_file(at: At, path: Path, camera: Camera) -> Float[Tensor, "h w 3"
             pixels = np.asarray(picture, dtype=np.float32)
     if pixels is None:
         expected = f"{camera.width} x {camera.height} pixels, as the camera has"
-        refuse(at, expected, f"{str(at.value)!r} with {size[0]} x {size[1]} pixels")
+        at.refuse(expected, f"{str(at.value)!r} with {size[0]} x {size[1]} pixels")
     return torch.from_numpy(pixels / np.float32(255))
 
 
@@ -131,7 +131,7 @@ def reference_frame(folder: Path) -> int:
     if not (folder / "cameras.npz").is_file():
         return 0
     at = read_npz(folder / "cameras.npz")
-    given = maybe(at, "reference") or maybe(at, "frame")
+    given = at.maybe("reference") or at.maybe("frame")
     value = np.zeros(1) if given is None else np.asarray(given.value).reshape(-1)
     return int(value[0]) if value.size and value.dtype.kind in "iu" else 0
 
@@ -181,12 +181,12 @@ def read_depth(
 
 def _of_npz(path: Path, names: tuple[str, ...], metric: bool, frame: int) -> NDArray[np.float64]:
     at = read_npz(path)
-    points = maybe(at, "points")
-    found = next((v for n in names if (v := maybe(at, n)) is not None), None)
+    points = at.maybe("points")
+    found = next((v for n in names if (v := at.maybe(n)) is not None), None)
     if found is None and metric and points is not None and np.ndim(points.value) == 3:
         return np.asarray(points.value, dtype=np.float64)[..., 2]
     if found is None:
-        refuse(at, f"one of the arrays {', '.join(names)} or points", f"{', '.join(at.value)}")
+        at.refuse(f"one of the arrays {', '.join(names)} or points", f"{', '.join(at.value)}")
     return _of_frame(found, frame)
 
 
@@ -197,12 +197,12 @@ def _of_frame(at: At, frame: int) -> NDArray[np.float64]:
         value = value[0] if value.shape[0] == 1 else value[..., 0]
     if value.ndim == 3 and value.shape[-1] > 4:
         if frame >= len(value):
-            refuse(at, f"a depth map of frame {frame}", f"{len(value)} frames")
+            at.refuse(f"a depth map of frame {frame}", f"{len(value)} frames")
         log.warning("depth maps of %d frames: that of frame %d is used", len(value), frame)
         value = value[frame]
     if value.dtype.kind == "f":  # unknown pixels may be NaN or infinite
         value = np.where(np.isfinite(value), value, 0)
-    return array(At(value, at.file, at.field), ("h", "w")).astype(np.float64)
+    return at.holding(value).array(("h", "w")).astype(np.float64)
 
 
 def _of_png(path: Path, metric: bool) -> NDArray[np.float64]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mover.core.errors import InputError
 from mover.core.files import instead, reason
-from mover.io.files.fields import At, refuse, shown
+from mover.io.files.fields import At, shown
 
 MOST_NUMBERS = 1 << 27  # in one array of a glTF file
 MOST_ZEROS = 1 << 20  # in one that has no bytes in the file
@@ -69,7 +69,7 @@ def load_parts(at: At, path: Path, *, looks: bool = True, process: bool = False)
             raise
         except Exception as error:  # the parsers of six formats raise anything on broken files
             why = reason(error, path)
-            refuse(at, "a readable mesh", f"{at.value!r}, which cannot be read ({why})")
+            at.refuse("a readable mesh", f"{at.value!r}, which cannot be read ({why})")
     bare = {n: part for n, part in scene.geometry.items() if not len(getattr(part, "faces", ()))}
     if len(bare) == len(scene.geometry):
         count = sum(len(part.vertices) for part in bare.values())
@@ -77,7 +77,7 @@ def load_parts(at: At, path: Path, *, looks: bool = True, process: bool = False)
         said = f"an empty mesh{': ' * bool(count)}{points * bool(count)}"
         if found := instead(path):
             said = f"which cannot be read: {found}"
-        refuse(at, "a mesh with faces", f"{at.value!r}, {said}")
+        at.refuse("a mesh with faces", f"{at.value!r}, {said}")
     if bare:
         scene.delete_geometry(list(bare))
     return scene
@@ -97,7 +97,7 @@ def check_faces(at: At, faces: NDArray[Any], count: int) -> None:
     """Refuse faces that name vertices which do not exist."""
     if faces.size and (faces.min() < 0 or faces.max() >= count):
         found = f"faces that name vertices {faces.min()} to {faces.max()}"
-        refuse(at, f"vertices 0 to {count - 1}", found)
+        at.refuse(f"vertices 0 to {count - 1}", found)
 
 
 # glTF: what a file may make of a few bytes.
@@ -121,15 +121,15 @@ def check_gltf(at: At, path: Path, *, pictures: bool = False) -> None:
     for extension in tree.get("extensionsRequired", []):
         if extension in PACKED:
             found = f"{at.value!r}, which is packed by {PACKED[extension]}"
-            refuse(at, "glTF without compression (Blender: export without Compression)", found)
+            at.refuse("glTF without compression (Blender: export without Compression)", found)
     for kind, part, name in _uris(tree):
         outside = ".." in re.split(r"[/\\]", name) or path.suffix.lower() == ".glb"
         wanted = kind == "buffers" or (pictures and outside)
         if wanted and beside(path, name) is None:
-            refuse(at, f"{kind} beside it", f"{at.value!r} with the file {shown(part['uri'])}")
+            at.refuse(f"{kind} beside it", f"{at.value!r} with the file {shown(part['uri'])}")
     for count, most, what in _amounts(tree):
         if count > most:
-            refuse(at, f"at most {most}", f"{at.value!r} with {count} {what}")
+            at.refuse(f"at most {most}", f"{at.value!r} with {count} {what}")
 
 
 def _uris(tree: Any) -> Iterator[tuple[str, dict[str, str], str]]:  # noqa: ANN401

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mover.core.files import copy_whole, replacing
 from mover.core.types import Mesh, SeatStretch
-from mover.io.files.fields import LARGEST, LARGEST_FILE, At, reason, refuse, shown, text
+from mover.io.files.fields import LARGEST, LARGEST_FILE, At, reason, shown
 from mover.io.files.looks import check_faces, companions, load_parts
 
 KINDS = (".glb", ".gltf", ".obj", ".ply", ".off", ".stl")
@@ -18,18 +18,18 @@ THINNEST = 1e-9  # a mesh that is thinner along two axes has no surface
 
 def inside(at: At, folder: Path) -> Path:
     """The file that a relative path names, which may not lie outside of the folder."""
-    name = text(at)
+    name = at.text()
     path = Path(name)
     if path.is_absolute() or ".." in path.parts or "\0" in name or "\\" in name:
-        refuse(at, "a relative path with forward slashes inside the capture's folder")
+        at.refuse("a relative path with forward slashes inside the capture's folder")
     try:
         full = (folder / path).resolve()
         if not full.is_relative_to(folder.resolve()):
-            refuse(at, "a file inside the capture's folder", f"{name!r}, a link that leaves it")
+            at.refuse("a file inside the capture's folder", f"{name!r}, a link that leaves it")
         if not full.is_file():
-            refuse(at, "a file", f"{shown(name)}, which does not exist")
+            at.refuse("a file", f"{shown(name)}, which does not exist")
     except (OSError, RuntimeError) as error:  # names that are too long, links in a circle
-        refuse(at, "a file", f"{shown(name)}, which cannot be found ({reason(error)})")
+        at.refuse("a file", f"{shown(name)}, which cannot be found ({reason(error)})")
     return full
 
 
@@ -41,9 +41,9 @@ def read_mesh(at: At, folder: Path) -> tuple[Mesh, str]:
     """
     path = inside(at, folder)
     if path.suffix.lower() not in KINDS:
-        refuse(at, f"a file of kind {', '.join(KINDS)}")
+        at.refuse(f"a file of kind {', '.join(KINDS)}")
     if path.stat().st_size > LARGEST_FILE:
-        refuse(at, f"at most {LARGEST_FILE} bytes", f"a file of {path.stat().st_size}")
+        at.refuse(f"at most {LARGEST_FILE} bytes", f"a file of {path.stat().st_size}")
     verts, faces = load_arrays(at, path)
     return mesh_of(verts, faces, at), str(path)
 
@@ -62,18 +62,18 @@ def mesh_of(verts: NDArray[Any], faces: NDArray[Any], at: At) -> Mesh:
     """
     if verts.ndim != 2 or verts.shape[1:] != (3,) or faces.ndim != 2 or faces.shape[1:] != (3,):
         found = f"vertices of shape {verts.shape} and faces of shape {faces.shape}"
-        refuse(at, "triangles: (vertices, 3) and (faces, 3)", found)
+        at.refuse("triangles: (vertices, 3) and (faces, 3)", found)
     check_faces(at, faces, len(verts))
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
     if not len(faces):
-        refuse(at, "a mesh with faces", "an empty mesh")
+        at.refuse("a mesh with faces", "an empty mesh")
     kept, flat = np.unique(faces, return_inverse=True)
     verts = verts[kept]
     if not (np.abs(verts) <= LARGEST).all():
-        refuse(at, "finite vertices", "a mesh with NaN or infinite vertices")
+        at.refuse("finite vertices", "a mesh with NaN or infinite vertices")
     if np.sort(np.ptp(verts, axis=0))[1] < THINNEST:
-        refuse(at, "a mesh with a surface", "a mesh that is a line or a point")
+        at.refuse("a mesh with a surface", "a mesh that is a line or a point")
     places = torch.from_numpy(np.ascontiguousarray(verts, dtype=np.float32))
     return Mesh(places, torch.from_numpy(flat.reshape(-1, 3).astype(np.int64)))
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mover.core.errors import InputError
 from mover.core.files import replacing, unreadable
 from mover.core.records import BROKEN
-from mover.io.files.fields import LARGEST_FILE, At, existing, mapping
+from mover.io.files.fields import LARGEST_FILE, At, existing
 
 
 class NotPlain:
@@ -31,7 +31,7 @@ AMASS = (
 
 def is_amass(at: At) -> bool:
     """Whether these are the arrays of a motion."""
-    keys = mapping(at).keys()
+    keys = at.mapping().keys()
     return "trans" in keys and "frame" not in keys and not keys.isdisjoint(("poses", "pose_body"))
 
 

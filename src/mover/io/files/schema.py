@@ -14,22 +14,7 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from mover.io.files.fields import (
-    FASTEST,
-    LARGEST,
-    LAST_ID,
-    LAST_INDEX,
-    MISSING,
-    SLOWEST,
-    At,
-    get,
-    integer,
-    items,
-    mapping,
-    number,
-    refuse,
-    text,
-)
+from mover.io.files.fields import FASTEST, LARGEST, LAST_ID, LAST_INDEX, MISSING, SLOWEST, At
 
 Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST, description="a finite number")]
 Positive = Annotated[float, Meta(ge=1 / LARGEST, le=LARGEST, description="a number above 0")]
@@ -68,7 +53,7 @@ def checked(at: At, kind: Any) -> Any:
         InputError: If a field is missing or wrong: file, field, found, expected.
     """
     value = at.value.item() if isinstance(at.value, np.generic) else at.value
-    at, origin, args = At(value, at.file, at.field), get_origin(kind), get_args(kind)
+    at, origin, args = at.holding(value), get_origin(kind), get_args(kind)
     if origin in (Union, types.UnionType):
         if value is None and types.NoneType in args:
             return None
@@ -78,16 +63,16 @@ def checked(at: At, kind: Any) -> Any:
         return _within(at, *args)
     if origin is Literal:
         if not any(type(value) is type(one) and value == one for one in args):
-            refuse(at, "one of " + ", ".join(map(str, args)))
+            at.refuse("one of " + ", ".join(map(str, args)))
         return value
     if origin is tuple:
-        return tuple(checked(*pair) for pair in zip(items(at, len(args)), args, strict=True))
+        return tuple(checked(*pair) for pair in zip(at.items(len(args)), args, strict=True))
     if origin is list:
-        return [checked(item, args[0]) for item in items(at)]
+        return [checked(item, args[0]) for item in at.items()]
     if origin is dict:
-        return {key: checked(get(at, key), args[1]) for key in mapping(at)}
+        return {key: checked(at.get(key), args[1]) for key in at.mapping()}
     if isinstance(kind, type) and issubclass(kind, Struct):
-        given = [(f, get(at, f.encode_name)) for f in _fields(kind)]
+        given = [(f, at.get(f.encode_name)) for f in _fields(kind)]
         given.sort(key=lambda pair: pair[1].value is MISSING)  # what is wrong before what lacks
         return kind(**{f.name: checked(one, f.type) for f, one in given
                        if f.required or one.value is not MISSING})  # fmt: skip
@@ -96,13 +81,13 @@ def checked(at: At, kind: Any) -> Any:
 
 def _truth(at: At) -> bool:
     if not isinstance(at.value, bool):
-        refuse(at, "true or false")
+        at.refuse("true or false")
     return at.value
 
 
 PLAIN: Mapping[Any, Callable[[At], Any]] = {
-    Text: text, str: text, float: number, bool: _truth,
-    int: partial(integer, low=-LAST_ID, high=LAST_ID),
+    Text: At.text, str: At.text, float: At.number, bool: _truth,
+    int: partial(At.integer, low=-LAST_ID, high=LAST_ID),
 }  # fmt: skip
 
 
@@ -114,21 +99,21 @@ def _fields(kind: type[Struct]) -> tuple[msgspec.structs.FieldInfo, ...]:
 def _tagged(at: At, kinds: list[type[Struct]]) -> type[Struct]:
     """Of several structs the one that a field names."""
     tags = {kind.__struct_config__.tag: kind for kind in kinds}
-    field = get(at, kinds[0].__struct_config__.tag_field or "type")
+    field = at.get(kinds[0].__struct_config__.tag_field or "type")
     return tags[checked(field, Literal[tuple(tags)])]
 
 
 def _within(at: At, base: Any, meta: Any) -> Any:  # noqa: ANN401
     """A number between bounds, or a list that is not too long."""
     if base is int:
-        return integer(at, meta.ge, meta.le)
+        return at.integer(meta.ge, meta.le)
     if base is float:
         is_number = isinstance(at.value, int | float) and not isinstance(at.value, bool)
         if not is_number or not meta.ge <= at.value <= meta.le:
-            refuse(at, meta.description or f"a finite number from {meta.ge:g} to {meta.le:g}")
+            at.refuse(meta.description or f"a finite number from {meta.ge:g} to {meta.le:g}")
         return float(at.value)
-    if len(items(at)) > meta.max_length:
-        refuse(at, meta.description, f"{len(at.value)} items")
+    if len(at.items()) > meta.max_length:
+        at.refuse(meta.description, f"{len(at.value)} items")
     return checked(at, base)
 
 
@@ -137,7 +122,7 @@ def rotation(at: At) -> NDArray[np.float64]:
     given = np.array(checked(at, Rows))
     error = float(abs(given @ given.T - np.eye(3)).max())
     if not error < ROUGH or np.linalg.det(given) < 0:
-        refuse(at, "a rotation matrix (orthonormal rows, determinant +1)")
+        at.refuse("a rotation matrix (orthonormal rows, determinant +1)")
     if error < EXACT:
         return given
     u, _, v = np.linalg.svd(given)
@@ -148,6 +133,6 @@ def rigid(at: At) -> NDArray[np.float64]:
     """A 4 x 4 rigid transform of nested lists, its rotation the nearest exact one."""
     out = np.array(checked(at, tuple[Box, Box, Box, Box]))
     if out[3].tolist() != [0, 0, 0, 1]:
-        refuse(at, "a rigid transform whose last row is 0 0 0 1")
-    out[:3, :3] = rotation(At(out[:3, :3].tolist(), at.file, at.field))
+        at.refuse("a rigid transform whose last row is 0 0 0 1")
+    out[:3, :3] = rotation(at.holding(out[:3, :3].tolist()))
     return out

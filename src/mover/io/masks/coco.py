@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mover.core.errors import InputError
 from mover.core.types import Camera, Masks
 from mover.geometry.rle import run_lengths
-from mover.io.files.fields import LAST_ID, At, Warn, get, integer, items, maybe, refuse, unique
+from mover.io.files.fields import LAST_ID, At, Warn, unique
 from mover.io.files.schema import Id, Text, checked
 
 CORNERS = 3  # a polygon has at least so many
@@ -119,10 +119,10 @@ def _check_polygon(polygon: Any, reach: float, where: str, what: str) -> None:  
 def check_image(at: At, camera: Camera) -> int:
     """The id of an image, whose size must be the camera's."""
     for key, size in (("width", camera.width), ("height", camera.height)):
-        given = maybe(at, key)
-        if given is not None and integer(given) != size:
-            refuse(given, f"{size}, as the camera has")
-    return integer(get(at, "id"))
+        given = at.maybe(key)
+        if given is not None and given.integer() != size:
+            given.refuse(f"{size}, as the camera has")
+    return at.get("id").integer()
 
 
 class CategoryFields(Struct, frozen=True):
@@ -135,22 +135,22 @@ class CategoryFields(Struct, frozen=True):
 def categories_of(at: At) -> dict[int, str]:
     """Names by id."""
     rows, seen = checked(at, list[CategoryFields]), set[object]()
-    for item, row in zip(items(at), rows, strict=True):
-        unique(get(item, "id"), seen, row.id, "an id")
+    for item, row in zip(at.items(), rows, strict=True):
+        unique(item.get("id"), seen, row.id, "an id")
     return {row.id: str(row.name) for row in rows}
 
 
 def category_of(at: At, names: dict[int, str]) -> str:
     """The name of a category."""
-    key = integer(at, 0, LAST_ID)
+    key = at.integer(0, LAST_ID)
     if key not in names:
-        refuse(at, "the id of one of the categories")
+        at.refuse("the id of one of the categories")
     return names[key]
 
 
 def mask_of(at: At, camera: Camera, warn: Warn) -> Masks | None:
     """The mask of an annotation, None without segmentation."""
-    given = maybe(at, "segmentation")
+    given = at.maybe("segmentation")
     if given is None or not is_drawn(given.value):
         return None
     size, polygons = (camera.height, camera.width), isinstance(given.value, list)

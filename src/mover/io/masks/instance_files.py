@@ -9,19 +9,7 @@ from msgspec import Struct, field
 
 from mover.core.errors import InputError
 from mover.io.capture.parts import UNKNOWN, Hints, Parts
-from mover.io.files.fields import (
-    LAST_INDEX,
-    At,
-    choice,
-    get,
-    items,
-    maybe,
-    number,
-    read_json,
-    refuse,
-    text,
-    vector,
-)
+from mover.io.files.fields import LAST_INDEX, At, read_json
 from mover.io.files.images import image_size
 from mover.io.files.schema import Id, Index, Share, Side, Text, checked
 from mover.io.masks.coco import CategoryFields, is_drawn
@@ -256,20 +244,20 @@ def coco_instances(
 
     With `picture` only that image counts, and where no name is its, the only one with annotations.
     """
-    listed = [(item, checked(item, ImageFields)) for item in items(get(at, "images"))]
-    rows = [(item, checked(item, RowFields)) for item in items(get(at, "annotations"))]
-    given, known = maybe(at, "categories"), {image.id for _, image in listed}
+    listed = [(item, checked(item, ImageFields)) for item in at.get("images").items()]
+    rows = [(item, checked(item, RowFields)) for item in at.get("annotations").items()]
+    given, known = at.maybe("categories"), {image.id for _, image in listed}
     words = dict(zip(COCO_IDS, COCO_CLASSES, strict=True))
     if given is not None:
         words = {row.id: str(row.name) for row in checked(given, list[CategoryFields])}
     words |= {int(key): name for key, name in names.items() if key.isdecimal()}
     for item, row in rows:
         if row.image_id not in known:
-            refuse(get(item, "image_id"), "the id of one of the images")
+            item.get("image_id").refuse("the id of one of the images")
         if row.category_id is not None and row.category_id not in words:
-            refuse(get(item, "category_id"), "the id of one of the categories")
+            item.get("category_id").refuse("the id of one of the categories")
         if row.bbox is None and not is_drawn(row.segmentation):
-            refuse(item, "an annotation with bbox or segmentation")
+            item.refuse("an annotation with bbox or segmentation")
     notes: tuple[str, ...] = ()
     if picture is not None and len(listed) > 1:
         used = {row.image_id for _, row in rows}
@@ -278,13 +266,13 @@ def coco_instances(
         listed = [(item, image) for item, image in listed if image.id == ours.id]
         rows = [(item, row) for item, row in rows if row.image_id == ours.id]
     if picture is not None and len(rows) > MOST_THINGS:
-        refuse(get(at, "annotations"), f"at most {MOST_THINGS} in a picture", f"{len(rows)} items")
+        at.get("annotations").refuse(f"at most {MOST_THINGS} in a picture", f"{len(rows)} items")
     sizes = {image.id: _size_of_image(item, image, size) for item, image in listed}
     tracked = any(row.track_id is not None for _, row in rows)
     frames, more = _frames_of_images([image for _, image in listed], at.file, tracked=tracked)
     found = [_instance(item, row, sizes[row.image_id or 0], words, frames) for item, row in rows]
     if len(set(sizes.values())) > 1:
-        refuse(get(at, "images"), "images of one size", f"{len(set(sizes.values()))} sizes")
+        at.get("images").refuse("images of one size", f"{len(set(sizes.values()))} sizes")
     looked, own = frozenset(frames.values()), next(iter(sizes.values()), size)
     return Instances(tuple(found), own, at.file, looked, (*notes, *more))
 
@@ -292,7 +280,7 @@ def coco_instances(
 def _size_of_image(at: At, image: ImageFields, size: Size | None) -> Size:
     """Width and height of an image: its own, else the known ones [px]."""
     own = (image.width, image.height) if image.width and image.height else size
-    return own or refuse(at, "width and height, here or by --image")
+    return own or at.refuse("width and height, here or by --image")
 
 
 def _ours(
@@ -334,10 +322,10 @@ def list_instances(at: At, names: Names, size: Size | None) -> Instances:
     An item has `class` (a name) or `category_id`; `bbox` and `segmentation` or `mask`. COCO's ids
     have gaps; a file whose ids only make sense counted from 0 is read so. Frames are image_ids.
     """
-    rows = [(item, checked(item, RowFields)) for item in items(at)]
+    rows = [(item, checked(item, RowFields)) for item in at.items()]
     for item, row in rows:
         if row.bbox is None and row.mask is None and not is_drawn(row.segmentation):
-            refuse(item, "a detection with bbox, segmentation or mask")
+            item.refuse("a detection with bbox, segmentation or mask")
     keys = {row.category_id for _, row in rows if row.category_id is not None}
     contiguous = not keys <= set(COCO_IDS) and max(keys) < len(COCO_CLASSES)
     table = enumerate(COCO_CLASSES) if contiguous else zip(COCO_IDS, COCO_CLASSES, strict=True)
@@ -358,10 +346,10 @@ def _instance(
     """One row. MOVER's boxes are corners with the score behind, COCO's have width and height."""
     box, score = None, row.score
     if row.bbox is not None and len(row.bbox) == 5 and row.category_id is None:
-        *box, last = vector(get(at, "bbox"), 5)
-        score = number(At(last, at.file, f"{at.field}.bbox"), 0, 1) if score is None else score
+        *box, last = at.get("bbox").vector(5)
+        score = At(last, at.file, f"{at.field}.bbox").number(0, 1) if score is None else score
     elif row.bbox is not None:
-        box = _corners(get(at, "bbox"), sized=row.name is None)
+        box = _corners(at.get("bbox"), sized=row.name is None)
     key = -1 if row.category_id is None else row.category_id
     return Instance(
         category=words.get(key, UNKNOWN) if row.name is None else str(row.name),
@@ -376,57 +364,57 @@ def _instance(
 def _drawn(at: At, row: RowFields) -> At | None:
     """What a row has as its mask: rows of pixels as their code, polygons, or a code."""
     if not isinstance(row.mask, list):
-        return maybe(at, "segmentation")
-    return At(mask_code(get(at, "mask")), at.file, f"{at.field}.mask")
+        return at.maybe("segmentation")
+    return At(mask_code(at.get("mask")), at.file, f"{at.field}.mask")
 
 
 def _size_of(code: At) -> Size:
     """Width and height of a run-length code [px]."""
-    height, width = checked(get(code, "size"), tuple[Side, Side])
+    height, width = checked(code.get("size"), tuple[Side, Side])
     return width, height
 
 
 def _corners(at: At, *, sized: bool) -> tuple[float, ...]:
     """The corners of a box that may be given by its width and height."""
-    a, b, c, d = vector(at, 4)
+    a, b, c, d = at.vector(4)
     return (a, b, a + c, b + d) if sized else (a, b, c, d)
 
 
 def _of_grounded_sam(at: At) -> Instances:
     """The results of Grounded-SAM-2's demos of pictures, with DUMP_JSON_RESULTS."""
-    size = checked(get(at, "img_width"), Side), checked(get(at, "img_height"), Side)
-    sized = choice(get(at, "box_format"), ("xyxy", "xywh")) == "xywh"
+    size = checked(at.get("img_width"), Side), checked(at.get("img_height"), Side)
+    sized = at.get("box_format").choice(("xyxy", "xywh")) == "xywh"
     found: list[Instance] = []
-    for item in items(get(at, "annotations")):
-        name, box, given = get(item, "class_name"), maybe(item, "bbox"), get(item, "segmentation")
-        category = text(name) if name.value != "" else UNKNOWN
-        corners, score = None if box is None else _corners(box, sized=sized), maybe(item, "score")
+    for item in at.get("annotations").items():
+        name, box, given = item.get("class_name"), item.maybe("bbox"), item.get("segmentation")
+        category = name.text() if name.value != "" else UNKNOWN
+        corners, score = None if box is None else _corners(box, sized=sized), item.maybe("score")
         while score is not None and isinstance(score.value, list) and len(score.value) == 1:
-            (score,) = items(score)
-        sure = 1.0 if score is None else min(number(score, 0, 2), 1.0)  # SAM 2's may be above 1
+            (score,) = score.items()
+        sure = 1.0 if score is None else min(score.number(0, 2), 1.0)  # SAM 2's may be above 1
         found.append(Instance(category, corners, code_in(given, size), sure))
     return Instances(tuple(found), size, at.file)
 
 
 def _of_mmdet(at: At, names: Names, size: Size | None) -> Instances:
     """Predictions of MMDetection's DetInferencer: lists of labels, scores, bboxes and masks."""
-    outer = maybe(at, "predictions")
-    at = at if outer is None else items(outer, 1)[0]
-    labels, boxes, masks = get(at, "labels"), maybe(at, "bboxes"), maybe(at, "masks")
-    scores, found, few = items(get(at, "scores")), list[Instance](), 0
+    outer = at.maybe("predictions")
+    at = at if outer is None else outer.items(1)[0]
+    labels, boxes, masks = at.get("labels"), at.maybe("bboxes"), at.maybe("masks")
+    scores, found, few = at.get("scores").items(), list[Instance](), 0
     keys = checked(labels, list[Id])
     table = {str(k): name for k, name in enumerate(COCO_CLASSES)} | dict(names)
-    if len({len(keys), len(scores), *(len(items(one)) for one in (boxes, masks) if one)}) > 1:
-        refuse(labels, f"as many as scores, bboxes and masks ({len(scores)})", f"{len(keys)} items")
+    if len({len(keys), len(scores), *(len(one.items()) for one in (boxes, masks) if one)}) > 1:
+        labels.refuse(f"as many as scores, bboxes and masks ({len(scores)})", f"{len(keys)} items")
     for k, key in enumerate(keys):
-        score = number(scores[k], 0, 1)
+        score = scores[k].number(0, 1)
         few += score < LEAST_SCORE
         if score < LEAST_SCORE:
             continue
         if str(key) not in table:
-            refuse(items(labels)[k], f"a class of COCO, 0 to {len(COCO_CLASSES) - 1}, or --names")
-        box = None if boxes is None else tuple(vector(items(boxes)[k], 4))
-        given = None if masks is None else items(masks)[k]
+            labels.items()[k].refuse(f"a class of COCO, 0 to {len(COCO_CLASSES) - 1}, or --names")
+        box = None if boxes is None else tuple(boxes.items()[k].vector(4))
+        given = None if masks is None else masks.items()[k]
         size = size if given is None else _size_of(given)
         found.append(Instance(table[str(key)], box, code_in(given, size), score))
     note = f"{at.file}: {few} of {len(keys)} detections with scores below {LEAST_SCORE} left out"
@@ -456,16 +444,16 @@ def labelme_instances(at: At) -> Instances:
     size = tree.image_width, tree.image_height
     groups: dict[tuple[str, int | None], list[list[float]]] = {}
     first: dict[tuple[str, int | None], At] = {}
-    for index, item in enumerate(items(get(at, "shapes"))):
+    for index, item in enumerate(at.get("shapes").items()):
         shape = checked(item, ShapeFields)
-        kind = choice(get(item, "shape_type"), ("polygon", "rectangle"))
+        kind = item.get("shape_type").choice(("polygon", "rectangle"))
         points = shape.points
         if kind == "rectangle" and len(points) == 2:
             (x0, y0), (x1, y1) = points
             points = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
         key = str(shape.label), -1 - index if shape.group_id is None else shape.group_id
         groups.setdefault(key, []).append([v for point in points for v in point])
-        first.setdefault(key, get(item, "points"))
+        first.setdefault(key, item.get("points"))
     found = [
         Instance(key[0], None, code_in(dataclasses.replace(first[key], value=polygons), size))
         for key, polygons in groups.items()

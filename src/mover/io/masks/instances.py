@@ -15,7 +15,7 @@ from mover.core.types import Masks
 from mover.furniture.library import plain_name, unknown_names
 from mover.geometry.rle import area, decode, encode, mask_boxes
 from mover.io.capture.parts import UNKNOWN
-from mover.io.files.fields import LAST_INDEX, At, listed, read_json, refuse
+from mover.io.files.fields import LAST_INDEX, At, listed, read_json
 from mover.io.masks.coco import annotations_tree, from_coco, is_drawn, segmentation
 from mover.io.people import found as bodies
 
@@ -61,9 +61,9 @@ def mask_code(at: At) -> dict[str, Any]:
     try:
         pixels = np.asarray(at.value)
     except ValueError:
-        return refuse(at, "rows of booleans of one length")
+        return at.refuse("rows of booleans of one length")
     if pixels.ndim != 2 or pixels.dtype.kind not in "bui" or not pixels.size:
-        refuse(at, "rows of booleans of one length")
+        at.refuse("rows of booleans of one length")
     return {"size": list(pixels.shape), "counts": encode(torch.from_numpy(pixels != 0)).decode()}
 
 
@@ -77,7 +77,7 @@ def code_in(given: At | None, size: Size | None) -> bytes | None:
     if given is None or not is_drawn(given.value):
         return None
     if size is None:
-        refuse(given, "the size of the image beside polygons: give --image")
+        given.refuse("the size of the image beside polygons: give --image")
     width, height = size
     code = from_coco(given.value, height, width, given.place)
     return code if area(Masks(height, width, (code,)), 0) else None

@@ -12,18 +12,7 @@ from numpy.typing import NDArray
 from mover.core.errors import InputError
 from mover.core.pickles import load_plain
 from mover.io.capture.parts import UNKNOWN
-from mover.io.files.fields import (
-    LAST_INDEX,
-    At,
-    array,
-    get,
-    integer,
-    mapping,
-    maybe,
-    read_json,
-    refuse,
-    text,
-)
+from mover.io.files.fields import LAST_INDEX, At, read_json
 from mover.io.files.images import opened
 from mover.io.files.npz import read_npy, read_npz
 from mover.io.masks.instances import Instance, Instances, Size, code_of, frames_of
@@ -118,7 +107,7 @@ def _labels_in(at: At) -> list[int]:
     """The numbers of things in an array of labels."""
     labels = [int(v) for v in np.unique(at.value[np.isfinite(at.value)]).tolist() if v > 0]
     if len(labels) > MOST_LABELS:
-        refuse(at, f"at most {MOST_LABELS} labels", f"{len(labels)} different values")
+        at.refuse(f"at most {MOST_LABELS} labels", f"{len(labels)} different values")
     return labels
 
 
@@ -150,7 +139,7 @@ def _names_beside(path: Path) -> dict[str, str]:
     if not path.is_file():
         return {}
     at = read_json(path)
-    return {key: text(At(value, at.file, key)) for key, value in mapping(at).items()}
+    return {key: At(value, at.file, key).text() for key, value in at.mapping().items()}
 
 
 def _classes_beside(path: Path) -> dict[str, str]:
@@ -161,10 +150,10 @@ def _classes_beside(path: Path) -> dict[str, str]:
     file = path.parent.parent / "json_data" / f"{path.stem}.json"
     if path.suffix.lower() != ".npy" or not file.is_file():
         return {}
-    given = get(read_json(file), "labels").value
+    given = read_json(file).get("labels").value
     rows = given.values() if isinstance(given, Mapping) else given
     found = [At(row, file.name, f"labels[{k}]") for k, row in enumerate(rows)]
-    return {str(integer(get(row, "instance_id"))): text(get(row, "class_name")) for row in found}
+    return {str(row.get("instance_id").integer()): row.get("class_name").text() for row in found}
 
 
 def _word_of(stem: str) -> str:
@@ -199,7 +188,7 @@ def _labels_of(path: Path) -> NDArray[np.int64]:
     if kind == ".npy":
         value = np.squeeze(read_npy(path).value)
         if value.ndim != 2 or value.dtype.kind not in "bui":
-            refuse(At(value, path.name), "an array of labels (h, w)")
+            At(value, path.name).refuse("an array of labels (h, w)")
         return value.astype(np.int64)
     with opened(path, expected="a picture of masks", bombs="error") as picture:
         drawn = picture.mode == "P"
@@ -258,43 +247,43 @@ def read_mask_arrays(path: Path, names: Names, *, people: bool = False) -> Insta
     read = {".npz": read_npz, ".npy": read_npy}.get(path.suffix.lower())
     tree = load_plain(path) if read is None else read(path).value
     at = At({"masks": tree} if isinstance(tree, np.ndarray) else tree, path.name)
-    at = maybe(at, "video_segments") or at if read is None else at
-    frames = [(key, get(at, key)) for key in mapping(at)]
+    at = at.maybe("video_segments") or at if read is None else at
+    frames = [(key, at.get(key)) for key in at.mapping()]
     if frames and all(key.isdecimal() and isinstance(at.value, Mapping) for key, at in frames):
         rows = [row for key, at in frames for row in _segments(int(key), at, names)]
         if not rows:
-            refuse(at, "masks of objects in frames")
+            at.refuse("masks of objects in frames")
         return _gathered(rows, path.name, "masks", (int(key) for key, _ in frames))
     given = _first(at, MASKS)
     if given is None:
-        refuse(at, f"an array named {', '.join(MASKS)}", f"the arrays {sorted(at.value)[:6]}")
+        at.refuse(f"an array named {', '.join(MASKS)}", f"the arrays {sorted(at.value)[:6]}")
     stack = given.value
     if not isinstance(stack, np.ndarray) or stack.dtype.kind not in "buif" or stack.ndim < 2:
-        refuse(given, "an array of masks (n, h, w), (frames, objects, h, w) or labels (h, w)")
+        given.refuse("an array of masks (n, h, w), (frames, objects, h, w) or labels (h, w)")
     if stack.ndim == 2 and stack.dtype != np.bool_ and not (np.nan_to_num(stack) % 1).any():
         labels = _labels_in(given)
         rows = ((stack == v, Instance(names.get(str(v), UNKNOWN), None, None)) for v in labels)
         size = stack.shape[1], stack.shape[0]
         return replace(_gathered(rows, at.file, "masks", ()), size=size)
     if stack.ndim > 4 or not stack.size:
-        refuse(given, "an array of masks (n, h, w) or (frames, objects, h, w)")
+        given.refuse("an array of masks (n, h, w) or (frames, objects, h, w)")
     return _of_stack(at, stack, names, people=people)
 
 
 def _segments(frame: int, at: At, names: Names) -> Iterator[Row]:
     """The masks of a frame by the numbers of their objects."""
-    for track in mapping(at):
-        mask = get(at, track)
+    for track in at.mapping():
+        mask = at.get(track)
         pixels = np.squeeze(np.asarray(mask.value))
         if pixels.ndim != 2 or pixels.dtype.kind not in "buif" or not track.isdecimal():
-            refuse(mask, "a mask (1, h, w) under the number of its object")
+            mask.refuse("a mask (1, h, w) under the number of its object")
         name = names.get(track, UNKNOWN)
         yield pixels > 0, Instance(name, None, None, 1.0, frame, int(track))
 
 
 def _of_stack(at: At, stack: NDArray[Any], names: Names, *, people: bool) -> Instances:
     """The masks of a stack: of one image, of frames that an array names, or of all frames."""
-    ids, frame = _first(at, TRACKS), maybe(at, "frame")
+    ids, frame = _first(at, TRACKS), at.maybe("frame")
     one_id = ids is not None and isinstance(ids.value, np.ndarray) and ids.value.shape == (1,)
     height, width = stack.shape[-2:]
     flat = stack.reshape(-1, height, width)
@@ -313,12 +302,12 @@ def _of_stack(at: At, stack: NDArray[Any], names: Names, *, people: bool) -> Ins
     else:
         frames = np.zeros(rows, dtype=np.int64) if frame is None else _counted(frame, rows)
         tracks = None if ids is None else _counted(ids, rows)
-    words, scores = _first(at, CLASSES), maybe(at, "scores")
+    words, scores = _first(at, CLASSES), at.maybe("scores")
     labels, sure = [UNKNOWN] * rows, np.ones(rows)
     if words is not None and isinstance(words.value, np.ndarray) and words.value.dtype.kind == "U":
-        labels = [str(word) for word in array(words, (rows,), "text")]
+        labels = [str(word) for word in words.array((rows,), "text")]
     if scores is not None and isinstance(scores.value, np.ndarray) and scores.value.size == rows:
-        sure = np.clip(array(scores, scores.value.shape).reshape(-1), 0, 1)
+        sure = np.clip(scores.array(scores.value.shape).reshape(-1), 0, 1)
 
     def row(i: int) -> Instance:
         track = None if tracks is None else int(tracks[i])
@@ -341,12 +330,12 @@ def _follow_each_other(flat: NDArray[Any]) -> bool:
 
 def _first(at: At, keys: Sequence[str]) -> At | None:
     """The first of several names of an array that is there."""
-    return next((found for key in keys if (found := maybe(at, key)) is not None), None)
+    return next((found for key in keys if (found := at.maybe(key)) is not None), None)
 
 
 def _counted(at: At, rows: int) -> NDArray[np.int64]:
     """Frames or tracks, one a row."""
-    value = array(at, (rows,), "whole").astype(np.int64)
+    value = at.array((rows,), "whole").astype(np.int64)
     if (value < 0).any() or (value > LAST_INDEX).any():
-        refuse(at, f"whole numbers from 0 to {LAST_INDEX}")
+        at.refuse(f"whole numbers from 0 to {LAST_INDEX}")
     return value

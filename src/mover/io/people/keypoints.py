@@ -18,20 +18,7 @@ from mover.bodies.keypoints import LAYOUTS as JOINTS
 from mover.core.errors import InputError
 from mover.core.types import Keypoints
 from mover.io.capture.bodies_file import indices, scalar
-from mover.io.files.fields import (
-    FASTEST,
-    LARGEST,
-    SLOWEST,
-    At,
-    array,
-    choice,
-    get,
-    items,
-    mapping,
-    maybe,
-    read_json,
-    refuse,
-)
+from mover.io.files.fields import FASTEST, LARGEST, SLOWEST, At, read_json
 from mover.io.files.npz import read_npz, write_npz
 from mover.io.formats import chosen
 from mover.io.people.found import Known, followed
@@ -109,18 +96,18 @@ def read_instances(path: Path, known: Known, layout: str) -> Keypoints:
     """Keypoints of a JSON file of instances."""
     at = read_json(path)
     if not isinstance(at.value, dict | list):
-        refuse(at, "a list of instances, or an object with 'annotations' or 'instance_info'")
-    images = None if isinstance(at.value, list) else maybe(at, "instance_info")
+        at.refuse("a list of instances, or an object with 'annotations' or 'instance_info'")
+    images = None if isinstance(at.value, list) else at.maybe("instance_info")
     if images is not None:
         listed: list[tuple[At, int]] = []
-        for index, image in enumerate(items(images)):
-            number = maybe(image, "frame_id", "image_id")
+        for index, image in enumerate(images.items()):
+            number = image.maybe("frame_id", "image_id")
             frame = index if number is None else _integer(number)
-            listed += [(one, frame) for one in items(need(image, "instances"))]
+            listed += [(one, frame) for one in need(image, "instances").items()]
     else:
         rows = at if isinstance(at.value, list) else need(at, "annotations", "instance_info")
         listed = [
-            (one, _integer(need(one, "image_id", "frame_id", "frame"))) for one in items(rows)
+            (one, _integer(need(one, "image_id", "frame_id", "frame"))) for one in rows.items()
         ]
     count = LAYOUTS[layout]
     seen = [_instance(one, frame - known.first, count) for one, frame in listed]
@@ -131,26 +118,26 @@ def _integer(at: At) -> int:
     """A whole number, or the last number in a name."""
     found = re.findall(r"\d+", Path(str(at.value)).stem)
     if isinstance(at.value, bool) or not found:
-        refuse(at, "a number, or a name with one")
+        at.refuse("a number, or a name with one")
     return int(found[-1])
 
 
 def _instance(at: At, frame: int, count: int) -> PersonJoints:
     """One person of a list; a track that is no number from 0 is unknown."""
-    given, scores = need(at, "keypoints"), maybe(at, "keypoint_scores", "scores")
+    given, scores = need(at, "keypoints"), at.maybe("keypoint_scores", "scores")
     value = numbers(given)
     width = value.size // count if value.size % count == 0 else 0
     if width not in (2, 3) or (value.ndim > 1 and value.shape[-1] != width):
-        refuse(given, f"{count} joints of 2 or 3 numbers", f"shape {value.shape}")
+        given.refuse(f"{count} joints of 2 or 3 numbers", f"shape {value.shape}")
     joints = value.reshape(count, width)
     if width == 2:
         sure = None if scores is None else numbers(scores)
         if sure is None or sure.size != count:
-            refuse(given, f"{count} joints with 'keypoint_scores'", "points without confidences")
+            given.refuse(f"{count} joints with 'keypoint_scores'", "points without confidences")
         joints = np.concatenate([joints, sure.reshape(count, 1)], 1)
-    if "num_keypoints" in mapping(at):  # ground truth: 0 absent, 1 hidden, 2 visible
+    if "num_keypoints" in at.mapping():  # ground truth: 0 absent, 1 hidden, 2 visible
         joints = np.where([True, True, False], joints, joints > 0)
-    found = maybe(at, "track_id", "idx", "person_id")
+    found = at.maybe("track_id", "idx", "person_id")
     track: Any = -1 if found is None else found.value
     while isinstance(track, list):
         track = track[0] if len(track) == 1 else -1  # pyright: ignore[reportUnknownVariableType]
@@ -165,10 +152,10 @@ def read_openpose(path: Path, known: Known) -> Keypoints:
     for index, file in enumerate(files):
         name = file.stem.removesuffix("_keypoints")
         frame = number_in(name, index) - known.first if path.is_dir() else 0
-        for at in items(need(read_json(file), "people")):
+        for at in need(read_json(file), "people").items():
             need(at, "pose_keypoints_2d")
             joints = np.concatenate([_part(at, name, count) for name, count in PARTS.items()])
-            given = maybe(at, "person_id")
+            given = at.maybe("person_id")
             ids = [-1.0] if given is None else numbers(given).reshape(-1).tolist() or [-1.0]
             seen.append(PersonJoints(frame, int(ids[0]), joints))
     if any(one.joints[25:, 2].any() for one in seen):
@@ -179,12 +166,12 @@ def read_openpose(path: Path, known: Known) -> Keypoints:
 
 def _part(at: At, name: str, count: int) -> NDArray[np.float64]:
     """The triples of a part; zeros where it is not given."""
-    given = maybe(at, name)
+    given = at.maybe(name)
     if given is None or not np.size(numbers(given)):
         return np.zeros((count, 3))
     value = numbers(given)
     if value.size != count * 3:
-        refuse(given, f"{count} triples x, y, confidence", f"{value.size} numbers")
+        given.refuse(f"{count} triples x, y, confidence", f"{value.size} numbers")
     return value.reshape(count, 3)
 
 
@@ -208,21 +195,21 @@ def write_keypoints(keypoints: Keypoints, path: Path) -> None:
 def read_keypoints(path: Path) -> Keypoints:
     """Read and check keypoints.npz."""
     at = read_npz(path)
-    word = get(at, "layout")
-    layout = choice(At(str(array(word, (), "text")), at.file, "layout"), tuple(LAYOUTS))
-    frame = indices(get(at, "frame"), "B")
+    word = at.get("layout")
+    layout = At(str(word.array((), "text")), at.file, "layout").choice(tuple(LAYOUTS))
+    frame = indices(at.get("frame"), "B")
     if not (rows := len(frame)):
-        refuse(get(at, "frame"), "at least one row", "no rows")
-    points = array(get(at, "points"), (rows, LAYOUTS[layout], 2)).astype(np.float32)
-    sure = get(at, "confidence")
-    confidence = array(sure, (rows, LAYOUTS[layout])).astype(np.float32)
+        at.get("frame").refuse("at least one row", "no rows")
+    points = at.get("points").array((rows, LAYOUTS[layout], 2)).astype(np.float32)
+    sure = at.get("confidence")
+    confidence = sure.array((rows, LAYOUTS[layout])).astype(np.float32)
     if confidence.min() < 0 or confidence.max() > 1:
-        refuse(sure, "numbers from 0 to 1", f"{confidence.min():g} to {confidence.max():g}")
+        sure.refuse("numbers from 0 to 1", f"{confidence.min():g} to {confidence.max():g}")
     return Keypoints(
         points=torch.from_numpy(points),
         confidence=torch.from_numpy(confidence),
         layout=layout,
         frame=frame,
-        person=indices(get(at, "person"), rows),
+        person=indices(at.get("person"), rows),
         fps=scalar(at, "fps", SLOWEST, FASTEST),
     )

@@ -17,7 +17,7 @@ from mover.core.errors import InputError
 from mover.core.files import reason, unreadable
 from mover.core.records import BROKEN
 from mover.geometry.rotations import affine
-from mover.io.files.fields import At, existing, refuse
+from mover.io.files.fields import At, existing
 from mover.io.people import values as v
 from mover.io.people.values import need
 
@@ -37,7 +37,7 @@ def read_vipe(path: Path) -> At:
         given = need(v.read_any(lens), "data")
         focal = v.rows(given, None, 4)
         if len(focal) != len(T):
-            refuse(given, f"{len(T)} rows, as there are poses", f"{len(focal)}")
+            given.refuse(f"{len(T)} rows, as there are poses", f"{len(focal)}")
         focal = focal[:, 0] / (2 * focal[:, 2])
     return _arrays(at.file, T, frame, focal)
 
@@ -75,7 +75,7 @@ def read_slam(path: Path) -> At:
         return _arrays(at.file, np.linalg.inv(v.stacked(at, 4, 4)), np.arange(len(value)))
     row = v.rows(at, None, 7)
     if (row[:, :3] == 0).all() and (row[:, 3:] == [1, 0, 0, 0]).all():
-        refuse(at, "a camera that was followed (WHAM with its SLAM)", "WHAM's sign for none")
+        at.refuse("a camera that was followed (WHAM with its SLAM)", "WHAM's sign for none")
     T = affine(_turns(row[:, 3:], at.file), row[:, :3])
     return _arrays(at.file, T, np.arange(len(T)))
 
@@ -93,7 +93,7 @@ def read_tum(path: Path) -> At:
     frame = table[:, 0]
     if (frame != np.round(frame)).any():
         odd = float(frame[frame != np.round(frame)][0])
-        refuse(At(odd, file.name, "time"), "numbers of frames in place of seconds", f"{odd:g}")
+        At(odd, file.name, "time").refuse("numbers of frames in place of seconds", f"{odd:g}")
     T = affine(_turns(table[:, 4:], file.name), table[:, 1:4])
     return _arrays(file.name, T, frame.astype(np.int64))
 
@@ -115,7 +115,7 @@ def read_colmap(path: Path) -> At:
     names = {str(Path(row[9]).with_suffix("")): row for row in known if len(row) == 10}
     if len(names) < len(known) or not known:
         form = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, each picture once"
-        refuse(At(len(known), file.name), form)
+        At(len(known), file.name).refuse(form)
     numbered = v.frame_numbers(names, file.name)
     order = sorted(names, key=numbered.__getitem__)
     table = _table([" ".join(names[name][1:9]) for name in order], file.name, 8)
@@ -147,7 +147,7 @@ def _table(lines: list[str], name: str, width: int) -> NDArray[np.float64]:
     except ValueError as error:
         raise InputError(f"{name}: has a line with another form ({reason(error)})") from error
     if table.ndim != 2 or table.shape[1] != width or not np.isfinite(table).all():
-        refuse(At(table, name), f"lines of {width} finite numbers", f"shape {table.shape}")
+        At(table, name).refuse(f"lines of {width} finite numbers", f"shape {table.shape}")
     return table
 
 
@@ -156,7 +156,7 @@ def _turns(quaternions: Array, name: str) -> NDArray[np.float64]:
     from scipy.spatial.transform import Rotation
 
     if not np.abs(np.linalg.norm(quaternions, axis=1) - 1).max() < 0.01:
-        refuse(At(quaternions, name), "quaternions of length 1", "others")
+        At(quaternions, name).refuse("quaternions of length 1", "others")
     return Rotation.from_quat(quaternions).as_matrix()
 
 

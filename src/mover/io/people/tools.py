@@ -22,7 +22,7 @@ from mover.bodies.skinning import FLAT
 from mover.core.errors import InputError
 from mover.core.types import BodyPose
 from mover.io.capture.pose_file import GENDERS, NEEDED, moved
-from mover.io.files.fields import At, get, items, mapping, maybe, refuse
+from mover.io.files.fields import At
 from mover.io.people import values as v
 from mover.io.people.found import UNTRACKED, Found, Known, joined
 from mover.io.people.lens import assumed_lens, from_weak, lens, lens_of, movement, tilting
@@ -113,10 +113,10 @@ def _rows(tool: Tool, person: Person, known: Known) -> Found:
     count = len(turns)
     if frames is None:
         frames = np.arange(person.frame, person.frame + count)
-    shape = (maybe if tool.shapeless else need)(at, *tool.shape)
+    shape = at.maybe(*tool.shape) if tool.shapeless else need(at, *tool.shape)
     betas = np.zeros((count, SHAPES)) if shape is None else v.rows(shape, count, *tool.widths)
-    given, rate = maybe(at, tool.translation), maybe(at, *tool.rate)
-    turn, shift = (maybe(at, name) for name in tool.camera) if tool.camera else (None, None)
+    given, rate = at.maybe(tool.translation), at.maybe(*tool.rate)
+    turn, shift = (at.maybe(name) for name in tool.camera) if tool.camera else (None, None)
     if given is None and shift is None:
         need(at, tool.translation, *tool.camera[1:])
     place = np.zeros((count, 3)) if given is None else v.rows(given, count, 3)
@@ -157,15 +157,14 @@ def _turns(
         turned = _decoded(body, count, known)
     else:
         turned = v.angles(body, count, 23, 21)[:, : 69 if model == "smpl" else 63]
-    extra = {n: v.tensor(v.rows(one, count)) for n in EXTRA if (one := maybe(at, n)) is not None}
+    extra = {n: v.tensor(v.rows(one, count)) for n in EXTRA if (one := at.maybe(n)) is not None}
     return torch.cat([root, turned], 1), extra
 
 
 def _decoded(at: At, count: int, known: Known) -> Tensor:
     """VPoser's codes as angles, where its weights are known."""
     if known.decode is None:
-        refuse(
-            at,
+        at.refuse(
             "63 angles: SMPLify-X stored VPoser's code, which its decoder turns into angles "
             "(vposer.decode(body_pose, output_type='aa')); store these instead, or name VPoser's "
             "weights (--vposer)",
@@ -176,7 +175,7 @@ def _decoded(at: At, count: int, known: Known) -> Tensor:
 
 
 def _gender(at: At) -> str:
-    given = maybe(at, "gender")
+    given = at.maybe("gender")
     if given is None:
         return "neutral"
     value: Any = given.value.tolist() if isinstance(given.value, np.ndarray) else given.value
@@ -184,7 +183,7 @@ def _gender(at: At) -> str:
         value = value[0]
     word = value.decode(errors="replace") if isinstance(value, bytes) else str(value)
     if word not in GENDERS:
-        refuse(given, "one of " + ", ".join(GENDERS))
+        given.refuse("one of " + ", ".join(GENDERS))
     return word
 
 
@@ -201,18 +200,18 @@ def gvhmr(path: Path, _: Known) -> Iterator[Person]:
     """hmr4d_results.pt of GVHMR, smpl_params.pt of GEM: one person in all frames."""
     at = _in_folder(path, "hmr4d_results.pt", "smpl_params.pt")
     body = need(at, "smpl_params_incam", "body_params_incam")
-    world = maybe(at, "smpl_params_global", "body_params_global")
+    world = at.maybe("smpl_params_global", "body_params_global")
     warnings: tuple[str, ...] = ()
     if world is not None:
         root = v.angles(need(body, "global_orient"), None, 1)
         warnings = tilting(root, v.angles(need(world, "global_orient"), len(root), 1))
-    yield Person(body, K=maybe(at, "K_fullimg"), warnings=warnings)
+    yield Person(body, K=at.maybe("K_fullimg"), warnings=warnings)
 
 
 def wham(path: Path, known: Known) -> Iterator[Person]:
     """wham_output.pkl: people by their tracks."""
     for track, at in v.people_of(_in_folder(path, "wham_output.pkl")):
-        world, warnings = maybe(at, "pose_world"), ()
+        world, warnings = at.maybe("pose_world"), ()
         if world is not None:
             root = v.angles(need(at, "pose"), None, 24)[:, :3]
             warnings = tilting(root, v.angles(world, len(root), 24)[:, :3])
@@ -222,15 +221,15 @@ def wham(path: Path, known: Known) -> Iterator[Person]:
 def prompthmr(path: Path, _: Known) -> Iterator[Person]:
     """results.pkl: `people`, and the cameras beside them."""
     source = _in_folder(path, "results.pkl")
-    camera, world = maybe(source, "camera", "camera_world"), maybe(source, "camera_world")
+    camera, world = source.maybe("camera", "camera_world"), source.maybe("camera_world")
     K, warnings = None if camera is None else _image_lens(camera), ()
     if world is not None:
         R = v.stacked(need(world, "Rcw"), 3, 3)
         warnings = movement(R, v.rows(need(world, "Tcw"), len(R), 3))
     for track, one in v.people_of(need(source, "people")):
         body = need(one, "smplx_cam")
-        fields = {**mapping(body), "frames": need(one, "frames").value}
-        yield Person(At(fields, body.file, body.field), track, K=K, warnings=warnings)
+        fields = {**body.mapping(), "frames": need(one, "frames").value}
+        yield Person(body.holding(fields), track, K=K, warnings=warnings)
 
 
 def tram(path: Path, _: Known) -> Iterator[Person]:
@@ -240,7 +239,7 @@ def tram(path: Path, _: Known) -> Iterator[Person]:
     lens_of_all, warnings = None, ()
     if file.is_file():
         source = v.read_any(file)
-        lens_of_all, turn = _image_lens(source), maybe(source, "world_cam_R")
+        lens_of_all, turn = _image_lens(source), source.maybe("world_cam_R")
         if turn is not None:  # x_world = R x_cam + t
             R = np.swapaxes(v.stacked(turn, 3, 3), 1, 2)
             t = v.rows(need(source, "world_cam_T"), len(R), 3)
@@ -268,17 +267,17 @@ def pare(path: Path, known: Known) -> Iterator[Person]:
     files = videos[:1] or v.files_of(path, "*.pkl", "PARE's results")
     for k, file in enumerate(files):
         at, people = v.read_any(file), list[tuple[int | None, At]]()
-        if maybe(at, "orig_cam", "pred_pose") is None:  # of a video: people by track
+        if at.maybe("orig_cam", "pred_pose") is None:  # of a video: people by track
             people += v.people_of(at)
         else:
             count = len(v.rows(need(at, "orig_cam"), None, 4))
             frame = v.number_in(file.stem, k) - known.first if path.is_dir() else 0
-            fields = {**mapping(at), "frame_ids": np.full(count, frame)}
+            fields = {**at.mapping(), "frame_ids": np.full(count, frame)}
             people.append((None, At(fields, at.file)))
         for track, one in people:
             crop = torch.from_numpy(v.rows(need(one, "orig_cam"), None, 4).copy())
-            fields = {**mapping(one), "transl": from_weak(crop, known.camera).numpy()}
-            yield Person(At(fields, one.file, one.field), track)
+            fields = {**one.mapping(), "transl": from_weak(crop, known.camera).numpy()}
+            yield Person(one.holding(fields), track)
 
 
 def phalp(path: Path, known: Known) -> Iterator[Person]:
@@ -288,14 +287,14 @@ def phalp(path: Path, known: Known) -> Iterator[Person]:
     of 256 px at 5000 px, the image padded to a square.
     """
     source = v.read_any(v.only_file(path, "**/*.pkl", "the results of PHALP"))
-    frames = mapping(source)
+    frames = source.mapping()
     for index, name in enumerate(sorted(frames, key=lambda key: v.natural(Path(str(key))))):
         at = At(frames[name], source.file, str(name))
         camera = need(at, "camera")
         listed = list(camera.value) if isinstance(camera.value, np.ndarray) else camera.value
-        bodies, cameras = items(need(at, "smpl")), items(At(listed, camera.file, camera.field))
+        bodies, cameras = need(at, "smpl").items(), camera.holding(listed).items()
         tracks = v.whole(need(at, "tid"))
-        ages, sizes = maybe(at, "tracked_time"), maybe(at, "size")
+        ages, sizes = at.maybe("tracked_time"), at.maybe("size")
         if not len(bodies) == len(cameras) == len(tracks):
             n = f"{len(tracks)} tracks, {len(bodies)} bodies and {len(cameras)} cameras"
             raise InputError(f"{at.place} has {n}, expected as many of each")
@@ -305,11 +304,11 @@ def phalp(path: Path, known: Known) -> Iterator[Person]:
             height, width = v.stacked(sizes, 2)[0].tolist()
             size = width, height
         K = assumed_lens(known, lambda *sides: FOCAL / CROP * max(sides), size)
-        time = maybe(at, "time")
+        time = at.maybe("time")
         frame = index if time is None or v.one_number(time) < 0 else int(v.one_number(time))
         for k in range(len(tracks)):
             if len(age) != len(tracks) or age[k] == 0:
-                body = At({**mapping(bodies[k]), "camera": cameras[k].value}, at.file, at.field)
+                body = at.holding({**bodies[k].mapping(), "camera": cameras[k].value})
                 yield Person(body, int(tracks[k]), frame, K=K)
 
 
@@ -323,7 +322,7 @@ def slahmr(path: Path, _: Known) -> Iterator[Person]:
     """
     path = v.files_of(path, "**/*_world_results.npz", "SLAHMR's results")[-1]
     source = v.read_any(path)
-    if "prior_results" in path.name and maybe(source, "trans") is None:
+    if "prior_results" in path.name and source.maybe("trans") is None:
         raise InputError(
             f"{path.name}: is SLAHMR's motion prior, without positions; expected the file "
             "*_world_results.npz of the same number beside it"
@@ -337,14 +336,14 @@ def slahmr(path: Path, _: Known) -> Iterator[Person]:
         given = need(source, name)
         fields[name] = v.numbers(given)
         if fields[name].shape[:2] != (people, count):
-            refuse(given, f"({people}, {count}, n) numbers", f"shape {fields[name].shape}")
-    intrins = maybe(source, "intrins")
+            given.refuse(f"({people}, {count}, n) numbers", f"shape {fields[name].shape}")
+    intrins = source.maybe("intrins")
     K = None if intrins is None else lens(*v.stacked(intrins, 4)[0].tolist())
     whole = [(who, who, np.arange(count)) for who in range(people)]
     for track, who, frames in [*_visible(path, count, people)] or whole:
         of_one = {name: values[who][frames] for name, values in fields.items()}
         at = At({**of_one, "betas": betas[who], "frames": frames}, source.file)
-        R, t = v.stacked(get(at, "cam_R"), 3, 3), v.stacked(get(at, "cam_t"), 3)
+        R, t = v.stacked(at.get("cam_R"), 3, 3), v.stacked(at.get("cam_t"), 3)
         yield Person(at, track, K=K, warnings=movement(R, t))
 
 
@@ -390,8 +389,8 @@ def amass(path: Path, _: Known) -> Iterator[Person]:
         at = v.read_any(file)
         width = v.rows(need(at, "poses"), len(v.stacked(need(at, "trans"), 3))).shape[1]
         if width not in AMASS:
-            refuse(need(at, "poses"), f"rows of {' or '.join(map(str, AMASS))} angles")
-        at = At({**mapping(at), "turn": Y_UP, "shift": np.zeros(3)}, at.file, at.field)
+            need(at, "poses").refuse(f"rows of {' or '.join(map(str, AMASS))} angles")
+        at = at.holding({**at.mapping(), "turn": Y_UP, "shift": np.zeros(3)})
         yield Person(at, track, model=AMASS[width], warnings=(NO_CAMERA,))
 
 
@@ -413,7 +412,7 @@ def read_sam3dbody(path: Path, known: Known) -> Found:
     for file, image in zip(files, images, strict=True):
         at = v.read_any(file)
         people = at.value.tolist() if isinstance(at.value, np.ndarray) else at.value
-        listed = [at] if isinstance(people, Mapping) else items(At(people, at.file))
+        listed = [at] if isinstance(people, Mapping) else At(people, at.file).items()
         seen += [(numbered[image] - known.first, one) for one in listed]
     if not seen:
         raise InputError(f"{path}: has no people, expected at least one")
@@ -424,8 +423,8 @@ def _mesh(at: At, frame: int, known: Known) -> Found:
     """One person, under the lens of joints in space and in the image, else the focal length."""
     place = v.rows(need(at, "pred_cam_t"), 1, 3)
     verts = v.tensor(v.stacked(need(at, "pred_vertices"), 3) + place)
-    joints, pixels = maybe(at, "pred_keypoints_3d"), maybe(at, "pred_keypoints_2d")
-    focal = maybe(at, "focal_length")
+    joints, pixels = at.maybe("pred_keypoints_3d"), at.maybe("pred_keypoints_2d")
+    focal = at.maybe("focal_length")
     f = known.focal if focal is None else v.one_number(focal)
     assumed = dataclasses.replace(known, focal=f)
     given = None if f is None else assumed_lens(assumed, lambda *_: f)

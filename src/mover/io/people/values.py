@@ -16,16 +16,7 @@ from mover.core.errors import InputError
 from mover.core.files import unreadable
 from mover.core.pickles import load_plain
 from mover.core.records import BROKEN
-from mover.io.files.fields import (
-    LARGEST,
-    LAST_INDEX,
-    At,
-    existing,
-    mapping,
-    maybe,
-    read_json,
-    refuse,
-)
+from mover.io.files.fields import LARGEST, LAST_INDEX, At, existing, read_json
 from mover.io.files.npz import AMASS, is_amass, read_npz
 
 PICKLES = (".pkl", ".pickle", ".joblib", ".pt", ".pth")
@@ -117,11 +108,11 @@ def natural(path: Path) -> tuple[tuple[int, str], ...]:
 
 def need(at: At, *names: str) -> At:
     """The first of several names of a field that is there."""
-    found = maybe(at, *names)
+    found = at.maybe(*names)
     if found is None:
         place = f"{at.place}: " if at.field else f"{at.file}: "
         wanted = " or ".join(f"'{name}'" for name in names)
-        keys = [f"'{key}'" for key in mapping(at)]
+        keys = [f"'{key}'" for key in at.mapping()]
         more = f" and {len(keys) - SHOWN_KEYS} more" if len(keys) > SHOWN_KEYS else ""
         known = (", ".join(keys[:SHOWN_KEYS]) or "none") + more
         if is_amass(at):
@@ -132,7 +123,7 @@ def need(at: At, *names: str) -> At:
 
 def people_of(at: At) -> list[tuple[int, At]]:
     """The people of a mapping from track to person, numbered by their keys or in order."""
-    given = mapping(at)
+    given = at.mapping()
     if not given:
         raise InputError(f"{at.place} has no people, expected at least one track")
     keys = [str(key) for key in given]
@@ -140,7 +131,7 @@ def people_of(at: At) -> list[tuple[int, At]]:
     people: list[tuple[int, At]] = []
     for index, (key, value) in enumerate(zip(keys, given.values(), strict=True)):
         person = At(value, at.file, f"{at.field}.{key}" if at.field else key)
-        mapping(person)
+        person.mapping()
         people.append((int(key) if numbered else index, person))
     return people
 
@@ -150,9 +141,9 @@ def numbers(at: At) -> NDArray[np.float64]:
     try:
         value = np.asarray(at.value)
     except ValueError:  # lists of different lengths
-        refuse(at, "an array of numbers", "lists of different lengths")
+        at.refuse("an array of numbers", "lists of different lengths")
     if value.dtype.kind not in "fiub":
-        refuse(at, "an array of numbers")
+        at.refuse("an array of numbers")
     return value.astype(np.float64)
 
 
@@ -173,7 +164,7 @@ def rows(at: At, count: int | None, *widths: int) -> NDArray[np.float64]:
     if not fits or (count is not None and len(flat) not in (count, 1)):
         width = " or ".join(map(str, widths)) or "any"
         shape = f"({'n' if count is None else count}, {width})"
-        refuse(at, f"numbers that give {shape}", f"shape {numbers(at).shape}")
+        at.refuse(f"numbers that give {shape}", f"shape {numbers(at).shape}")
     return flat if count is None else np.broadcast_to(flat, (count, flat.shape[1]))
 
 
@@ -182,7 +173,7 @@ def stacked(at: At, *tail: int) -> NDArray[np.float64]:
     value = numbers(at)
     if not value.size or value.size % math.prod(tail):
         shape = ", ".join(map(str, ("n", *tail)))
-        refuse(at, f"numbers that give ({shape})", f"shape {value.shape}")
+        at.refuse(f"numbers that give ({shape})", f"shape {value.shape}")
     return value.reshape(-1, *tail)
 
 
@@ -190,7 +181,7 @@ def one_number(at: At) -> float:
     """The first number of an array, finite."""
     value = float(stacked(at, 1)[0, 0])
     if not abs(value) <= LARGEST:
-        refuse(at, "a finite number", f"{value}")
+        at.refuse("a finite number", f"{value}")
     return value
 
 
@@ -198,9 +189,9 @@ def whole(at: At, count: int | None = None) -> NDArray[np.int64]:
     """Whole numbers along one axis."""
     value = numbers(at).reshape(-1)
     if not (np.abs(value) <= LAST_INDEX).all() or (value != np.round(value)).any():
-        refuse(at, f"whole numbers up to {LAST_INDEX}")
+        at.refuse(f"whole numbers up to {LAST_INDEX}")
     if count is not None and len(value) != count:
-        refuse(at, f"{count} whole numbers", f"{len(value)}")
+        at.refuse(f"{count} whole numbers", f"{len(value)}")
     return value.astype(np.int64)
 
 
@@ -220,7 +211,7 @@ def vectors(matrices: NDArray[np.float64], at: At) -> NDArray[np.float64]:
     safe = np.where(known[..., None, None], matrices, np.eye(3))
     off = np.abs(safe @ np.swapaxes(safe, -1, -2) - np.eye(3)).max(initial=0.0)
     if off > LEAST_TURN or (np.linalg.det(safe) < 0).any():
-        refuse(at, "rotation matrices (orthonormal, determinant +1)", "matrices that are none")
+        at.refuse("rotation matrices (orthonormal, determinant +1)", "matrices that are none")
     found = Rotation.from_matrix(safe.reshape(-1, 3, 3)).as_rotvec().reshape(*known.shape, 3)
     return np.where(known[..., None], found, np.nan).reshape(len(matrices), -1)
 

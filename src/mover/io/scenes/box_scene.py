@@ -18,7 +18,7 @@ from mover.furniture.library import choose_piece
 from mover.io.capture.parts import Hints, Parts
 from mover.io.files import schema
 from mover.io.files.cameras import camera_of_tree
-from mover.io.files.fields import At, get, integer, items, maybe, read_json, refuse
+from mover.io.files.fields import At, read_json
 from mover.io.files.images import image_size
 from mover.io.files.schema import Id, Text, checked, rotation
 from mover.io.masks.instances import Instance, Instances, objects_tree
@@ -60,12 +60,12 @@ def box_parts(path: Path, hints: Hints) -> Parts:
         camera = camera_of_tree(At(tree.camera, at.file, "camera"), size)
     turn = up_axes(hints.up or tree.up or "y")
     if tree.frame == "camera":
-        tilt = None if camera is None else maybe(camera, "R_cam_world")
+        tilt = None if camera is None else camera.maybe("R_cam_world")
         turn = (np.array(LEVEL) if tilt is None else rotation(tilt)).T
     found = Pieces()
-    for i, (item, box) in enumerate(zip(items(get(at, "objects")), tree.objects, strict=True)):
+    for i, (item, box) in enumerate(zip(at.get("objects").items(), tree.objects, strict=True)):
         kind = Id if isinstance(box.id, int) else Text
-        name = "" if box.id is None else str(checked(get(item, "id"), kind))
+        name = "" if box.id is None else str(checked(item.get("id"), kind))
         found.add(str(box.category), name, partial(_placed, item, box, turn, i))
     return dataclasses.replace(
         found.parts(path.stem, path.name, tree.ground),
@@ -77,11 +77,11 @@ def box_parts(path: Path, hints: Hints) -> Parts:
 def _placed(at: At, box: BoxFields, turn: Matrix, index: int, _key: str) -> Placed:
     """The object of a box: the mesh of the library that fills it."""
     if box.rotation is not None:
-        axes = turn @ rotation(get(at, "rotation"))  # columns
+        axes = turn @ rotation(at.get("rotation"))  # columns
     elif box.yaw is not None:
         axes = about_y(box.yaw)  # about the vertical, from the front at +z
     else:
-        refuse(get(at, "yaw"), "an angle, or a 'rotation'")
+        at.get("yaw").refuse("an angle, or a 'rotation'")
     order, yaw = _upright(at, axes)
     size = np.array(box.size)[order]
     mesh = choose_piece(str(box.category), (float(size[0]), float(size[1]), float(size[2])))
@@ -108,7 +108,7 @@ def _upright(at: At, axes: Matrix) -> tuple[Sequence[int], float]:
     order = ([1, 0, 2], [0, 1, 2], [0, 2, 1])[up]  # z-up boxes: x stays, their -y is the front
     front = axes[:, order[2]] * (-1.0 if up == 2 and axes[1, 2] > 0 else 1.0)
     if math.hypot(front[0], front[2]) < 0.1:
-        refuse(get(at, "rotation"), "a box with an axis that is nearly level")
+        at.get("rotation").refuse("a box with an axis that is nearly level")
     return order, math.atan2(front[0], front[2])
 
 
@@ -120,5 +120,5 @@ def _annotations(boxes: Sequence[BoxFields], camera: At | None, file: str) -> At
         Instance(str(box.category), box.box2d, None, 1.0 if box.score is None else box.score)
         for box in boxes
     )
-    size = integer(get(camera, "w"), 1), integer(get(camera, "h"), 1)
+    size = camera.get("w").integer(1), camera.get("h").integer(1)
     return objects_tree(Instances(found, size, file), found)

@@ -17,7 +17,7 @@ import numpy as np
 from mover.core.errors import InputError
 from mover.geometry.rotations import affine
 from mover.io.capture.parts import Hints, Parts
-from mover.io.files.fields import At, maybe, reason
+from mover.io.files.fields import At, reason
 from mover.io.files.images import image_size
 from mover.io.files.looks import gltf_tree, load_parts, looks_lost
 from mover.io.people.values import natural
@@ -144,7 +144,7 @@ def _view(path: Path, hints: Hints) -> tuple[dict[str, Any], Matrix] | None:
         if index is None:
             return None
         lens = tree["cameras"][nodes[index]["camera"]]["perspective"]
-        at = maybe(At(lens, path.name, "cameras.perspective"), "aspectRatio")
+        at = At(lens, path.name, "cameras.perspective").maybe("aspectRatio")
         ratio = None if at is None else float(at.value)
         w, h = (0, 1080) if hints.image is None else image_size(hints.image)
         w = w or round(h * (ratio or 16 / 9))

@@ -19,18 +19,7 @@ from mover.core.errors import InputError
 from mover.geometry.rotations import affine
 from mover.io.capture.parts import Hints, Parts
 from mover.io.files.cameras import GUESSED, read_camera_file, with_spread
-from mover.io.files.fields import (
-    At,
-    array,
-    get,
-    listed,
-    mapping,
-    maybe,
-    number,
-    read_json,
-    refuse,
-    text,
-)
+from mover.io.files.fields import At, listed, read_json
 from mover.io.files.images import image_size
 from mover.io.files.looks import is_cloud, load_parts, looks_lost
 from mover.io.files.meshes import KINDS
@@ -74,8 +63,8 @@ def sam3d_parts(folder: Path, hints: Hints) -> Parts:
     R, how = _attitude(camera, matrices)
     found = Pieces()
     for path, pose, matrix in zip(paths, poses, matrices, strict=True):
-        words = (maybe(pose, key) for key in ("category", "label", "class"))
-        said = next((text(at) for at in words if at is not None), None)
+        words = (pose.maybe(key) for key in ("category", "label", "class"))
+        said = next((at.text() for at in words if at is not None), None)
         name = hints.names.get(path.stem) or said or category_of_name(path.stem)
         parts = load_parts(At(path.name, folder.name), path)
         found.add(name, path.stem, partial(placed, parts, affine(R.T) @ matrix, hints.work))
@@ -120,9 +109,9 @@ def _pose_beside(path: Path) -> At:
         own = path.with_suffix(kind)
         if own.is_file():
             at = read(own)
-            fields = mapping(at).items()
+            fields = at.mapping().items()
             plain = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in fields}
-            return At(plain, at.file, at.field)
+            return at.holding(plain)
     wanted = f"{path.stem}.npz or {path.stem}.json beside it"
     raise InputError(f"{path.name}: has no pose, expected {wanted}")
 
@@ -131,17 +120,17 @@ def pose_matrix(at: At) -> Matrix:
     """Camera from mesh (4, 4): rows v, ((v @ L.T) * scale) @ R(q) + t, then x and y turned."""
     from scipy.spatial.transform import Rotation
 
-    q = _numbers(get(at, "rotation"), 4)
+    q = _numbers(at.get("rotation"), 4)
     if not 0.5 < float(np.linalg.norm(q)) < 2:
-        refuse(get(at, "rotation"), "a unit quaternion (w, x, y, z)")
+        at.get("rotation").refuse("a unit quaternion (w, x, y, z)")
     R = Rotation.from_quat(np.roll(q, -1)).as_matrix()
-    given = get(at, "scale")
+    given = at.get("scale")
     one = isinstance(given.value, int | float)
-    scale = np.array([number(given)] * 3) if one else _numbers(given, 3)
+    scale = np.array([given.number()] * 3) if one else _numbers(given, 3)
     if (scale <= 0).any():
-        refuse(given, "scales above 0")
+        given.refuse("scales above 0")
     turn = TO_OPENCV @ R.T @ np.diag(scale) @ TO_LOCAL
-    return affine(turn, TO_OPENCV @ _numbers(get(at, "translation"), 3))
+    return affine(turn, TO_OPENCV @ _numbers(at.get("translation"), 3))
 
 
 def _numbers(at: At, count: int) -> Matrix:
@@ -149,13 +138,13 @@ def _numbers(at: At, count: int) -> Matrix:
     try:
         value = np.asarray(at.value, dtype=np.float64).reshape(-1)
     except (ValueError, TypeError):
-        return refuse(at, f"{count} numbers")
-    return array(At(value, at.file, at.field), (count,))
+        return at.refuse(f"{count} numbers")
+    return at.holding(value).array((count,))
 
 
 def _attitude(camera: At | None, matrices: Sequence[Matrix]) -> tuple[Matrix, str]:
     """R_cam_world: given, or that at which most objects stand upright, or level."""
-    given = None if camera is None else maybe(camera, "R_cam_world")
+    given = None if camera is None else camera.maybe("R_cam_world")
     if given is not None:
         return rotation(given), "the camera's tilt is the one that was given"
     ups = np.stack([matrix[:3, 1] for matrix in matrices])

@@ -25,18 +25,7 @@ from mover.io.capture.build import build_capture
 from mover.io.capture.parts import Hints, Parts
 from mover.io.capture.scene_file import scene_tree
 from mover.io.files.cameras import read_intrinsics
-from mover.io.files.fields import (
-    At,
-    array,
-    choice,
-    get,
-    items,
-    maybe,
-    number,
-    read_json,
-    refuse,
-    vector,
-)
+from mover.io.files.fields import At, read_json
 from mover.io.files.images import image_size, read_image
 from mover.io.files.meshes import KINDS, mesh_of, read_mesh
 from mover.io.masks.coco import annotations_tree
@@ -104,21 +93,21 @@ def load_mat(path: Path) -> At:
 
 def matrix(path: Path, key: str, shape: tuple[int, int]) -> NDArray[np.float64]:
     """A matrix of a MATLAB file."""
-    return array(get(load_mat(path), key), shape).astype(np.float64)
+    return load_mat(path).get(key).array(shape).astype(np.float64)
 
 
 def read_boxes(path: Path) -> list[TotalBox]:
     """All boxes, in the order of the detections."""
     content = load_mat(path)
-    cells = get(content, "bdb")
+    cells = content.get("bdb")
     if not isinstance(cells.value, np.ndarray) or cells.value.dtype != object:
-        refuse(cells, "a cell of boxes")
-    ids = array(get(content, "class_id"), (1, cells.value.size), "whole")[0]
+        cells.refuse("a cell of boxes")
+    ids = content.get("class_id").array((1, cells.value.size), "whole")[0]
     found: list[TotalBox] = []
     for i, (cell, key) in enumerate(zip(cells.value.ravel(), ids.tolist(), strict=True)):
         at = At(cell, content.file, f"bdb[{i}]")
         if not 0 <= key < len(CLASSES):
-            refuse(get(content, "class_id"), f"ids from 0 to {len(CLASSES) - 1}", f"{key}")
+            content.get("class_id").refuse(f"ids from 0 to {len(CLASSES) - 1}", f"{key}")
         found.append(_box(at, CLASSES[key]))
     return found
 
@@ -128,17 +117,17 @@ def _box(at: At, name: str) -> TotalBox:
     one = isinstance(at.value, np.ndarray) and at.value.size == 1
     names = at.value.dtype.names if one else None
     if not names or not {"basis", "coeffs", "centroid"} <= set(names):
-        refuse(at, "a struct with basis, coeffs, centroid")
+        at.refuse("a struct with basis, coeffs, centroid")
     struct = at.value.ravel()[0]
     parts = {key: At(struct[key], at.file, f"{at.field}.{key}") for key in names}
-    basis = array(parts["basis"], (3, 3)).astype(np.float64)
-    half = array(parts["coeffs"], (1, 3)).astype(np.float64)[0]
+    basis = parts["basis"].array((3, 3)).astype(np.float64)
+    half = parts["coeffs"].array((1, 3)).astype(np.float64)[0]
     if (half <= 0).any():
-        refuse(parts["coeffs"], "half sizes above 0", f"{half.tolist()}")
+        parts["coeffs"].refuse("half sizes above 0", f"{half.tolist()}")
     yaw = math.atan2(basis[2, 0], basis[2, 2])
     if abs(basis - about_y(-yaw)).max() > 1e-3:
-        refuse(parts["basis"], "the axes of an upright box", f"{basis.round(3).tolist()}")
-    return TotalBox(array(parts["centroid"], (1, 3)).astype(np.float64)[0], half, yaw, name)
+        parts["basis"].refuse("the axes of an upright box", f"{basis.round(3).tolist()}")
+    return TotalBox(parts["centroid"].array((1, 3)).astype(np.float64)[0], half, yaw, name)
 
 
 def find_mesh(folder: Path, index: int, name: str) -> Path:
@@ -163,7 +152,7 @@ def read_shape(path: Path) -> Shape:
         faces = np.array(corners, dtype=np.int64).reshape(-1, 3) - 1
     except (ValueError, OverflowError) as error:
         raise InputError(f"{path.name}: has {error}, expected vertices and triangles") from error
-    array(At(verts, path.name, "v"), ("V", 3))
+    At(verts, path.name, "v").array(("V", 3))
     if not len(verts):
         raise InputError(f"{path.name}: has an empty mesh, expected vertices and triangles")
     return verts, faces
@@ -182,14 +171,14 @@ def total3d_parts(folder: Path, hints: Hints) -> Parts:
     parts = [folder / name for name in ("input", "output")]
     source, result = [part if part.is_dir() else folder for part in parts]
     at = read_json(source / "detections.json")
-    names = [choice(get(item, "class"), CLASSES) for item in items(at)]
+    names = [item.get("class").choice(CLASSES) for item in at.items()]
     boxes = read_boxes(result / "bdb_3d.mat")
     box = matrix(result / "layout.mat", "layout", (8, 3))  # the upper four corners, the lower four
     floor = float(box[:, 1].min())
     if names != [box.name for box in boxes]:
         found = f"{len(boxes)} boxes of {[b.name for b in boxes][:4]} ..."
         at = At(names, "bdb_3d.mat", "class_id")
-        refuse(at, "the classes of detections.json, in order", found)
+        at.refuse("the classes of detections.json, in order", found)
     kept = {i: box for i, box in enumerate(boxes) if box.name in FURNITURE}
     files = {i: find_mesh(result, i, box.name) for i, box in kept.items()}
     shapes = {path.name: read_shape(path) for path in files.values()}
@@ -202,7 +191,7 @@ def total3d_parts(folder: Path, hints: Hints) -> Parts:
         name=folder.resolve().name,
         camera=_camera(source, result / "r_ex.mat"),
         scene=scene_tree(rows, result.name, floor),
-        objects=At(_annotations(items(at), list(kept)), "detections.json"),
+        objects=At(_annotations(at.items(), list(kept)), "detections.json"),
         load_mesh=load,
         load_image=partial(read_image, At("img.jpg", "input"), source),
     )
@@ -222,14 +211,14 @@ def _annotations(rows: Sequence[At], kept: Sequence[int]) -> dict[str, Any]:
     """The content of objects.json: boxes, and scores and masks where the file has them."""
     annotations: list[dict[str, Any]] = []
     for i in kept:
-        name, box = choice(get(rows[i], "class"), CLASSES), get(rows[i], "bbox")
+        name, box = rows[i].get("class").choice(CLASSES), rows[i].get("bbox")
         scored = isinstance(box.value, list) and len(box.value) == 5
-        left, top, right, bottom, *score = vector(box, 5 if scored else 4)
+        left, top, right, bottom, *score = box.vector(5 if scored else 4)
         row: dict[str, Any] = {"id": i, "image_id": 0, "category_id": name}
         row |= {"bbox": [left, top, right - left, bottom - top]}
         if score:
-            row["score"] = number(At(score[0], box.file, f"{box.field}[4]"), 0, 1)
-        mask = maybe(rows[i], "mask")
+            row["score"] = At(score[0], box.file, f"{box.field}[4]").number(0, 1)
+        mask = rows[i].maybe("mask")
         annotations.append(row if mask is None else {**row, "segmentation": mask_code(mask)})
     return annotations_tree(annotations, {}, CLASSES)
 
@@ -241,7 +230,7 @@ def _object(
     verts: NDArray[np.float64] = shapes[file][0]
     low, high = verts.min(0), verts.max(0)
     if (high <= low).any():
-        refuse(At(None, file), "a solid mesh", "a flat mesh")
+        At(None, file).refuse("a solid mesh", "a flat mesh")
     scale = 2 * box.half / (high - low)
     yaw = box.yaw + math.pi / 2  # TO_OURS is R_y of a quarter turn
     place = TO_OURS @ box.center - about_y(yaw) @ (scale * (low + high) / 2)
