@@ -50,15 +50,8 @@ class Agreement:
 
 NOTHING = Agreement(*[torch.zeros(0)] * 8, boxes=torch.zeros(0, 4))
 SCORES = (
-    "objects",
-    "sizes",
-    "turns",
-    "object_masks",
-    "people_masks",
-    "people",
-    "heights",
-    "upright",
-)
+    "objects", "sizes", "turns", "object_masks", "people_masks", "people", "heights", "upright",
+)  # fmt: skip
 
 
 def thinned_capture(capture: Capture) -> Capture:

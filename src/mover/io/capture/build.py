@@ -61,23 +61,13 @@ def build_capture(parts: Parts) -> Capture:
         if space is not None and str(space.array((), "text")) != "camera":
             space.refuse("'camera': cameras.npz carries people into the room's world", "'world'")
     capture = Capture(
-        name=parts.name,
-        scene=scene,
-        camera_height=lens.height,
-        detections=detections,
+        name=parts.name, scene=scene, camera_height=lens.height, detections=detections,
         reference=None if parts.load_image is None else parts.load_image(camera),
-        reference_people=people.reference,
-        bodies=bodies,
-        people=people.people,
-        touch=touch,
-        warnings=(),
-        hypotheses=others,
-        furniture=furniture,
-        path=path,
+        reference_people=people.reference, bodies=bodies, people=people.people, touch=touch,
+        warnings=(), hypotheses=others, furniture=furniture, path=path,
         depth=None if parts.load_depth is None else parts.load_depth(camera),
-        focal_spread=lens.focal_spread,
-        focal_by_lines=lens.focal_by_lines,
-    )
+        focal_spread=lens.focal_spread, focal_by_lines=lens.focal_by_lines,
+    )  # fmt: skip
     check_plausible(capture, warn)
     return dataclasses.replace(capture, warnings=tuple(warnings))
 

@@ -8,13 +8,7 @@ import torch
 
 from mover.core.types import Scene
 from mover.furniture.library import canonical
-from mover.io.capture.agreement import (
-    assigned,
-    in_image,
-    outermost,
-    outlines,
-    pairwise_iou2d,
-)
+from mover.io.capture.agreement import assigned, in_image, outermost, outlines, pairwise_iou2d
 from mover.io.capture.parts import UNKNOWN
 from mover.io.files.fields import At
 

@@ -56,14 +56,11 @@ def pose_of(at: At, rows: int) -> BodyPose | None:
     betas = at.get("betas")  # of one person or of each row
     wide = ("S",) if isinstance(betas.value, np.ndarray) and betas.value.ndim == 1 else (rows, "S")
     return BodyPose(
-        model=model,
-        gender="neutral" if gender is None else word(gender, GENDERS),
+        model=model, gender="neutral" if gender is None else word(gender, GENDERS),
         betas=values(betas, *wide).expand(rows, -1).clone(),
-        global_orient=values(at.get("global_orient"), rows, 3),
-        body_pose=angles,
-        transl=values(at.get("transl"), rows, 3),
-        extra=extra,
-    )
+        global_orient=values(at.get("global_orient"), rows, 3), body_pose=angles,
+        transl=values(at.get("transl"), rows, 3), extra=extra,
+    )  # fmt: skip
 
 
 def posed(

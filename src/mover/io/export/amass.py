@@ -63,17 +63,11 @@ def _arrays(motion: Motion, track: Track, bodies: Bodies) -> dict[str, NDArray[A
     shape = pose.betas[rows].double().mean(0).numpy()
     parts = PARTS.items() if poses.shape[1] == 165 else ()
     return {
-        "trans": pose.transl[rows].numpy(),
-        "root_orient": pose.global_orient[rows].numpy(),
-        "poses": poses,
-        "betas": shape,
-        "num_betas": np.array(len(shape)),
-        "gender": np.array(pose.gender),
-        "mocap_framerate": rate,
-        "mocap_frame_rate": rate,
-        "surface_model_type": np.array(pose.model),
-        "frame": track.frame.numpy(),
+        "trans": pose.transl[rows].numpy(), "root_orient": pose.global_orient[rows].numpy(),
+        "poses": poses, "betas": shape, "num_betas": np.array(len(shape)),
+        "gender": np.array(pose.gender), "mocap_framerate": rate, "mocap_frame_rate": rate,
+        "surface_model_type": np.array(pose.model), "frame": track.frame.numpy(),
         "size": motion.size[rows].numpy(),
         **{name: values[rows].numpy() for name, values in pose.extra.items()},
         **{name: poses[:, start:end] for name, (start, end) in parts},
-    }
+    }  # fmt: skip

@@ -83,15 +83,11 @@ def export_contacts(finished: Finished, folder: Path, up: Up = "y") -> Exported:
         for name, table in spots.items():
             table[cells] = getattr(labels, name)[kept].float()
         arrays = {
-            "frame": track.frame.numpy(),
-            "fps": np.array(clock_of(bodies)[1]),
-            "parts": np.array(labels.parts),
-            "objects": np.array(labels.objects),
-            "contact": contact.numpy(),
-            "object_contact": (contact.amax(1) >= SURE).numpy(),
-            "up_axis": np.array(up),
-            **{name: table.numpy() for name, table in spots.items()},
-        }
+            "frame": track.frame.numpy(), "fps": np.array(clock_of(bodies)[1]),
+            "parts": np.array(labels.parts), "objects": np.array(labels.objects),
+            "contact": contact.numpy(), "object_contact": (contact.amax(1) >= SURE).numpy(),
+            "up_axis": np.array(up), **{name: table.numpy() for name, table in spots.items()},
+        }  # fmt: skip
         files.append(folder / f"contacts_{track.person}.npz")
         write_npz(arrays, files[-1])
     note = f"object_contact is a confidence of {SURE:g} or more of any part"

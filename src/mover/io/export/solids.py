@@ -253,16 +253,11 @@ def _solid(item: SceneObject, convex: Convex, floor: float) -> Solid:
     mass = max(LEAST, volume * DENSITY.get(canonical(item.category), OTHER))
     inertia = AXES @ _stretched(convex.inertia, scale) @ AXES.mT * mass / max(volume, 1e-9)
     return Solid(
-        id=item.id,
-        category=item.category,
-        position=position,
-        yaw=float(item.yaw),
+        id=item.id, category=item.category, position=position, yaw=float(item.yaw),
         free=item.support != "free",
         hulls=tuple(Mesh(h.verts.double() * scale @ AXES.mT, h.faces) for h in convex.hulls),
-        mass=mass,
-        centre=AXES @ (scale * convex.centre),
-        inertia=_physical(inertia, mass),
-    )
+        mass=mass, centre=AXES @ (scale * convex.centre), inertia=_physical(inertia, mass),
+    )  # fmt: skip
 
 
 def moved_to(solid: Solid, item: SceneObject, frame: int) -> Solid:

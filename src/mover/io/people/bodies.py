@@ -68,16 +68,10 @@ def bodies_from(tool: str, path: Path, known: Known | None = None) -> ImportedBo
     if not (verts.abs() <= LARGEST).all():
         raise InputError(f"{file}: has bodies at positions that are not finite under this lens")
     bodies = Bodies(
-        verts=verts,
-        faces=_faces(verts.shape[1], model, known),
-        joints=joints,
-        joint_names=() if model is None else model.joint_names,
-        frame=values["frame"],
-        person=values["person"],
-        fps=known.fps or found.fps,
-        space=found.space,
-        pose=pose,
-    )
+        verts=verts, faces=_faces(verts.shape[1], model, known), joints=joints,
+        joint_names=() if model is None else model.joint_names, frame=values["frame"],
+        person=values["person"], fps=known.fps or found.fps, space=found.space, pose=pose,
+    )  # fmt: skip
     return ImportedBodies(bodies, lens, tuple(warnings))
 
 

@@ -83,13 +83,10 @@ def keypoints_of(
         person = followed(frame.tolist(), (low + high) / 2, size)
     order = np.lexsort((person, frame))
     return Keypoints(
-        points=tensor(points[order]),
-        confidence=tensor(sure[order]),
-        layout=layout,
+        points=tensor(points[order]), confidence=tensor(sure[order]), layout=layout,
         frame=torch.from_numpy(frame[order].astype(np.int64)),
-        person=torch.from_numpy(person[order].astype(np.int64)),
-        fps=fps,
-    )
+        person=torch.from_numpy(person[order].astype(np.int64)), fps=fps,
+    )  # fmt: skip
 
 
 def read_instances(path: Path, known: Known, layout: str) -> Keypoints:
@@ -206,10 +203,7 @@ def read_keypoints(path: Path) -> Keypoints:
     if confidence.min() < 0 or confidence.max() > 1:
         sure.refuse("numbers from 0 to 1", f"{confidence.min():g} to {confidence.max():g}")
     return Keypoints(
-        points=torch.from_numpy(points),
-        confidence=torch.from_numpy(confidence),
-        layout=layout,
-        frame=frame,
-        person=indices(at.get("person"), rows),
+        points=torch.from_numpy(points), confidence=torch.from_numpy(confidence), layout=layout,
+        frame=frame, person=indices(at.get("person"), rows),
         fps=scalar(at, "fps", SLOWEST, FASTEST),
-    )
+    )  # fmt: skip

@@ -236,12 +236,7 @@ def _object(
     place = TO_OURS @ box.center - about_y(yaw) @ (scale * (low + high) / 2)
     lifted = box.name in LIFTED and box.center[1] - box.half[1] > floor + ON_FLOOR
     return {
-        "id": f"{box.name}_{index}",
-        "category": box.name,
-        "mesh": file,
-        "annotation": index,
-        "translation": place.tolist(),
-        "yaw": math.atan2(math.sin(yaw), math.cos(yaw)),
-        "scale": scale.tolist(),
-        "support": "free" if lifted else "ground",
-    }
+        "id": f"{box.name}_{index}", "category": box.name, "mesh": file, "annotation": index,
+        "translation": place.tolist(), "yaw": math.atan2(math.sin(yaw), math.cos(yaw)),
+        "scale": scale.tolist(), "support": "free" if lifted else "ground",
+    }  # fmt: skip
