@@ -22,9 +22,8 @@ from mover.perceive.config import ModelsConfig
 from mover.perceive.networks import JointsInputs, Tracks
 from mover.perceive.video import Clip
 from mover_bench.rooms.config import NoiseConfig, RoomConfig
-from mover_bench.rooms.known import KnownRoom
+from mover_bench.rooms.known import KnownRoom, make_room
 from mover_bench.rooms.noise import add_noise, hidden_rows
-from mover_bench.rooms.room import make_room
 from mover_bench.rooms.seen import Seen
 
 DETECTED = (*range(100, 110), 112, 114, 120, 122, 123, 124, 125, 126, 128, 130, 132, 133, 134, 136)

@@ -29,9 +29,8 @@ from mover.perceive.layout import FirstScene, Picture, first_scene
 from mover.pipeline.presets import PRESETS
 from mover.pipeline.reconstruct import reconstruct
 from mover_bench.rooms.config import NoiseConfig
-from mover_bench.rooms.known import KnownRoom
+from mover_bench.rooms.known import KnownRoom, make_room
 from mover_bench.rooms.noise import add_noise
-from mover_bench.rooms.room import make_room
 
 
 def picture_of(capture: Capture) -> Picture:

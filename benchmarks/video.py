@@ -43,9 +43,8 @@ from mover.io.capture.scene_file import read_scene
 from mover.io.files.meshes import write_mesh
 from mover_bench.experiment.sets import parse_seeds
 from mover_bench.rooms.config import NoiseConfig, RoomConfig
-from mover_bench.rooms.known import KnownRoom
+from mover_bench.rooms.known import KnownRoom, make_room
 from mover_bench.rooms.noise import add_noise
-from mover_bench.rooms.room import make_room
 from mover_bench.rooms.seen import COCO, Seen, write_video
 
 FPS = 5.0

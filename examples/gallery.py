@@ -22,11 +22,11 @@ from mover.bodies.skinning import open_body
 from mover.core.types import Bodies, Camera, Scene, SceneObject
 from mover.furniture.library import STYLES, make_piece
 from mover_bench.rooms.config import RoomConfig
+from mover_bench.rooms.known import draw_frame, make_room
 from mover_bench.rooms.motion import Performance, Stage, Stop, Task, perform
 from mover_bench.rooms.placed import Placed
 from mover_bench.rooms.poses import make_person, rows, skinned
 from mover_bench.rooms.render import COLOURS
-from mover_bench.rooms.room import draw_frame, make_room
 
 CELL, CAPTION, MOST = (230, 200), 20, 250_000  # [px], [px], [bytes] of a sheet
 SEATS = ("chair", "armchair", "office chair", "stool", "bench", "sofa")

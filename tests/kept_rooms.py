@@ -9,8 +9,7 @@ from pathlib import Path
 from mover.core.observe import Observer, silent
 from mover.core.run import Run, sources
 from mover_bench.rooms.config import RoomConfig
-from mover_bench.rooms.known import KnownRoom
-from mover_bench.rooms.room import demo_room, make_room
+from mover_bench.rooms.known import KnownRoom, demo_room, make_room
 
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mover-tests"
 FEW = 2  # rooms of one kind that are kept: of these sources, and of those before them

@@ -14,6 +14,7 @@ import pytest
 import torch
 from scipy.stats import bootstrap
 
+from mover.app.batch import last_line
 from mover.app.cli import run_command
 from mover.app.report.tables import shown
 from mover.core import records
@@ -34,7 +35,7 @@ from mover_bench.experiment import job, run
 from mover_bench.experiment.measures import Judge, Trial
 from mover_bench.experiment.run import Jobs, run_each, run_experiment
 from mover_bench.experiment.sets import CHANGES, SETS, changed, parse_seeds
-from mover_bench.experiment.tables import head_of, interval, last_line
+from mover_bench.experiment.tables import head_of, interval
 from mover_bench.experiment.variants import (
     LISTS,
     VARIANTS,

@@ -14,8 +14,7 @@ from mover_bench.experiment.job import true_room, with_noise
 from mover_bench.experiment.measures import seat_height
 from mover_bench.experiment.sets import SETS, parse_seeds
 from mover_bench.rooms.config import NoiseConfig, RoomConfig
-from mover_bench.rooms.known import KnownRoom
-from mover_bench.rooms.room import make_room
+from mover_bench.rooms.known import KnownRoom, make_room
 
 
 @pytest.fixture(scope="module")

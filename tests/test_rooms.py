@@ -20,7 +20,7 @@ from mover_bench.experiment.sets import SETS
 from mover_bench.rooms.compose import Plan, draw_plan, make_view, overlap
 from mover_bench.rooms.config import RoomConfig
 from mover_bench.rooms.gait import duration, stations, walk
-from mover_bench.rooms.known import Actor, KnownRoom, build
+from mover_bench.rooms.known import Actor, KnownRoom, build, make_room
 from mover_bench.rooms.motion import Stage, Stop, Task, perform
 from mover_bench.rooms.placed import NoWayError, Placed, free_of, way
 from mover_bench.rooms.poses import Person, Posture, make_person, skinned
@@ -35,7 +35,6 @@ from mover_bench.rooms.resting import (
     supine,
     table_stand,
 )
-from mover_bench.rooms.room import make_room
 from mover_bench.rooms.truth import part
 
 SHAPES = ([0.0] * 10, [1.3, -1.0, 0.5] + [0.0] * 7)

@@ -218,8 +218,8 @@ def test_a_video_becomes_a_room_and_files_that_are_replaced_stay(
     from mover.core.records import rows_of
     from mover.pipeline.presets import PRESETS
     from mover_bench.rooms.config import NoiseConfig
+    from mover_bench.rooms.known import draw_frame
     from mover_bench.rooms.noise import add_noise
-    from mover_bench.rooms.room import draw_frame
     from mover_bench.rooms.seen import Seen
 
     monkeypatch.setitem(PRESETS, "robust", light("robust"))

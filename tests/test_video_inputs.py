@@ -341,8 +341,8 @@ def test_three_seconds_of_a_phone_held_upright_become_a_room(tmp_path: Path):
     from kept_rooms import drawn, kept
 
     from mover_bench.rooms.config import NoiseConfig, RoomConfig
+    from mover_bench.rooms.known import draw_frame
     from mover_bench.rooms.noise import add_noise
-    from mover_bench.rooms.room import draw_frame
     from mover_bench.rooms.seen import Seen
 
     config = RoomConfig(width=270, height=480, stay=0.3, least_frames=60)

@@ -16,23 +16,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from mover.core.errors import InputError
-from mover.geometry.rotations import affine
+from mover.core.types import Mesh
 from mover.io.capture.parts import Hints, Parts
 from mover.io.files.fields import At, read_json
-from mover.io.files.looks import load_parts
-from mover.io.files.meshes import load_arrays, mesh_of, read_mesh, write_mesh
+from mover.io.files.meshes import load_arrays, mesh_of, write_mesh
 from mover.io.files.schema import rotation
 from mover.io.masks.coco import annotations_tree
-from mover.io.scenes.placing import (
-    LEVEL,
-    Matrix,
-    Pieces,
-    Placed,
-    about_y,
-    write_parts,
-)
+from mover.io.scenes.placing import LEVEL, Matrix, Pieces, Placed, about_y
 from mover.io.scenes.total3d import CLASSES, FURNITURE
 
 SCENE = Path("models") / "scene.ply"
@@ -67,16 +60,14 @@ def holisticmesh_parts(folder: Path, hints: Hints) -> Parts:
         if category not in FURNITURE:
             continue
         own = verts[i * size : (i + 1) * size]
-        file = hints.work / f"holisticmesh_{i}.glb"
-        write_mesh(mesh_of(own, faces[owner[:, 0] == i] - i * size, at), file)
-        copy = partial(without_axes, file, affine(R.T))
-        found.add(category, f"{category}_{i}", lambda key, c=copy: c(hints.work / f"{key}.glb"))
+        place = partial(upright, mesh_of(own, faces[owner[:, 0] == i] - i * size, at), R)
+        found.add(category, f"{category}_{i}", lambda key, p=place: p(hints.work / f"{key}.glb"))
         found.rows[-1]["annotation"] = i
         box = row.get("bbox")  # of the mirrored picture, with a score where it has five numbers
         scored = isinstance(box.value, list) and len(box.value) == 5
         left, top, right, bottom = box.vector(5 if scored else 4)[:4]
-        place = [float(camera["w"]) - right, top, right - left, bottom - top]
-        annotations.append({"id": i, "image_id": 0, "category_id": category, "bbox": place})
+        kept = [float(camera["w"]) - right, top, right - left, bottom - top]
+        annotations.append({"id": i, "image_id": 0, "category_id": category, "bbox": kept})
     how = "level, as --camera has no R_cam_world" if tilt is None else "as given"
     return dataclasses.replace(
         found.parts(folder.resolve().name, str(SCENE)),
@@ -89,19 +80,13 @@ def holisticmesh_parts(folder: Path, hints: Hints) -> Parts:
 TURNS = 90  # angles that are tried for the box around a footprint, over a quarter turn
 
 
-def without_axes(path: Path, world: Matrix, file: Path) -> Placed:
-    """The object of a mesh that lies where it is, and a copy about the middle of its bottom.
+def upright(mesh: Mesh, R_cam_world: Matrix, file: Path) -> Placed:
+    """The object of a mesh in camera axes, and a file of it about the middle of its bottom.
 
     Its box is the upright one with the smallest footprint; its front is the side that faces the
     camera, as that of furniture along walls.
-
-    Args:
-        path: The mesh.
-        world: Our world (+y up, the camera at the origin) from its vertices (4, 4).
-        file: Where the copy goes.
     """
-    mesh, _ = read_mesh(At(path.name, path.name), path.parent)
-    verts = mesh.verts.double().numpy() @ world[:3, :3].T + world[:3, 3]
+    verts = mesh.verts.double().numpy() @ R_cam_world
     flat, angles = verts[:, [0, 2]], np.arange(TURNS) * (math.pi / 2 / TURNS)
     x = flat @ np.stack([np.cos(angles), -np.sin(angles)])
     z = flat @ np.stack([np.sin(angles), np.cos(angles)])
@@ -113,10 +98,7 @@ def without_axes(path: Path, world: Matrix, file: Path) -> Placed:
     local = verts @ about_y(yaw)  # rows: R_y(-yaw) v
     low, high = local.min(0), local.max(0)
     origin = np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
-    found = write_parts(
-        load_parts(At(path.name, path.parent.name), path),
-        affine(about_y(-yaw), -origin) @ world,
-        file,
-    )
+    mesh = Mesh(torch.from_numpy(local - origin).float(), mesh.faces)
+    write_mesh(mesh, file)
     fields = {"translation": (about_y(yaw) @ origin).tolist(), "yaw": yaw, "scale": [1.0] * 3}
-    return fields, found, ""
+    return fields, (mesh, str(file)), ""

@@ -20,6 +20,7 @@ from torch import Tensor
 from mover.core.errors import InputError
 from mover.core.types import Camera, Detection, Keypoints, Masks, Mesh, Scene, SceneObject
 from mover.geometry.camera import tilted
+from mover.geometry.mesh import bottom_center
 from mover.geometry.raster import first_hit
 from mover.geometry.rle import encode, tight_box
 from mover.geometry.rotations import rot_y
@@ -48,8 +49,7 @@ class Part:
     """An oriented box of one object's part, in camera axes."""
 
     name: str
-    axes: Float[Tensor, "3 3"]
-    """Columns."""
+    axes: Float[Tensor, "3 3"]  #: columns
     centre: Float[Tensor, "3"]
     size: Float[Tensor, "3"]
 
@@ -67,8 +67,7 @@ class I3dbScene:
     """A recording, with its truth."""
 
     name: str
-    truth: Scene
-    """What shows `FEWEST_PIXELS` or more."""
+    truth: Scene  #: what shows `FEWEST_PIXELS` or more
     detections: tuple[Detection, ...]
     keypoints: Keypoints
     imapper: tuple[SceneObject, ...]
@@ -144,11 +143,16 @@ def lowest(parts: list[Part], R: Float[Tensor, "3 3"]) -> Float[Tensor, ""]:
     return torch.cat([part.mesh().verts for part in parts]).matmul(R)[:, 1].min()
 
 
+def largest(parts: list[Part]) -> Part:
+    """The part of the largest volume, the first of equals."""
+    return max(parts, key=lambda part: float(part.size.prod()))
+
+
 def legs_below(parts: list[Part], R: Float[Tensor, "3 3"], floor: float) -> list[Part]:
     """Four legs of a table of which only the top was modelled."""
     if any(part.name.startswith("leg") for part in parts) or lowest(parts, R) < floor + 0.15:
         return []
-    top = max(parts, key=lambda part: float(part.size.prod()))
+    top = largest(parts)
     up, k = R[:, 1], top.upright()
     long = top.centre @ up - floor - top.size[k] / 2
     size = torch.full((3,), LEG)
@@ -165,14 +169,14 @@ def legs_below(parts: list[Part], R: Float[Tensor, "3 3"], floor: float) -> list
 def front_of(parts: list[Part], R: Float[Tensor, "3 3"]) -> float:
     """Yaw of the front: away from the back, else of the shorter side to the camera [rad]."""
     seats = [p for p in parts if p.name.startswith(("seat", "top", "shelf", "stool"))] or parts
-    seat = max(seats, key=lambda part: float(part.size.prod()))
+    seat = largest(seats)
     sides = [
         (sign * R.mT @ seat.axes[:, a], float(seat.size[a]))
         for a in range(3) if a != seat.upright() for sign in (1, -1)
     ]  # fmt: skip
     backs = [part for part in parts if part.name.startswith("back")]
     if backs:
-        back = max(backs, key=lambda part: float(part.size.prod()))
+        back = largest(backs)
         flat = [a for a in range(3) if a != back.upright()]
         thin = R.mT @ back.axes[:, min(flat, key=lambda a: float(back.size[a]))]
         thin = thin * (thin @ (R.mT @ (seat.centre - back.centre))).sign()
@@ -191,8 +195,7 @@ def object_of(key: tuple[int, str], parts: list[Part], R: Float[Tensor, "3 3"]) 
     verts = torch.cat([mesh.verts for mesh in meshes]) @ R @ rot_y(yaw)
     counts = np.cumsum([0, *(len(mesh.verts) for mesh in meshes[:-1])])
     faces = torch.cat([m.faces + int(n) for m, n in zip(meshes, counts, strict=True)])
-    low, high = verts.amin(0), verts.amax(0)
-    base = torch.stack([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
+    base = bottom_center(verts.amin(0), verts.amax(0))
     return SceneObject(
         id=f"{key[1]}_{key[0]}", category=key[1], mesh=Mesh(verts - base, faces), mesh_file="",
         annotation=None, support="ground", t_world_object=rot_y(yaw) @ base, yaw=yaw,
@@ -253,9 +256,5 @@ def _touch(parts: list[Part], other: Part, R: Float[Tensor, "3 3"]) -> bool:
     """Whether the upright bounds of two parts overlap within 5 cm."""
     ours = other.mesh().verts @ R
     low, high = ours.amin(0) - 0.05, ours.amax(0) + 0.05
-    for part in parts:
-        verts = part.mesh().verts @ R
-        flat = [0, 2]
-        if bool(((verts.amin(0) < high) & (verts.amax(0) > low))[flat].all()):
-            return True
-    return False
+    each = (part.mesh().verts @ R for part in parts)
+    return any(bool(((v.amin(0) < high) & (v.amax(0) > low))[[0, 2]].all()) for v in each)

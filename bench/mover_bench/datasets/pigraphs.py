@@ -1,7 +1,7 @@
 """People of Kinect's 25 joints, as capsules along the bones: a body that any mesh stage takes."""
 
-import dataclasses
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -126,7 +126,7 @@ def pigraphs_parts(root: Path, hints: Hints) -> Parts:
     parts = Parts(name=path.stem, camera=At(lens, path.name), bodies=bodies, notes=tuple(notes))
     if hints.image is not None:
         load, size = image_parts(hints.image, mirrored=not mirror)
-        parts = dataclasses.replace(parts, load_image=load, image_size=size)
+        parts = replace(parts, load_image=load, image_size=size)
     from_camera = affine(to_camera)  # its own inverse
     return _with_truth(parts, root, path.stem.split("_")[0], matrix @ from_camera)
 
@@ -200,7 +200,7 @@ def _with_truth(parts: Parts, root: Path, room: str, scan_cam: Matrix) -> Parts:
     files = sorted(p for p in home.rglob(f"{room}*segs.json"))
     if not files:
         note = f"{room}d.segs.json: missing, so no truth"
-        return dataclasses.replace(parts, notes=(*parts.notes, note))
+        return replace(parts, notes=(*parts.notes, note))
     boxes = read_segments(files[0])
     world, R = world_of(scan_cam)
     assert parts.camera is not None
@@ -210,7 +210,7 @@ def _with_truth(parts: Parts, root: Path, room: str, scan_cam: Matrix) -> Parts:
     if scans:
         ground = floor_in(read_scan(scans[0]), world)
     truth = boxes_scene(boxes, world, camera, ground)
-    return dataclasses.replace(parts, beside={"truth/scene.json": partial(write_scene, truth)})
+    return replace(parts, beside={"truth/scene.json": partial(write_scene, truth)})
 
 
 def read_segments(path: Path) -> list[TrueBox]:

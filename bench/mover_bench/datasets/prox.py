@@ -8,8 +8,8 @@ authors (--boxes), and in the quantitative part the bodies of MoSh. The capture 
 that: its camera is level, its furniture comes from elsewhere. What is missing is named.
 """
 
-import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -129,7 +129,7 @@ def _with_given_fits(parts: Parts, lines: Sequence[Timeline], tracks: Mapping[st
         bodies = _joined(found, tracks, [])
         if bodies is not None:
             beside[f"fits/{kind}.npz"] = partial(write_bodies, bodies)
-    return dataclasses.replace(parts, beside=beside)
+    return replace(parts, beside=beside)
 
 
 def _with_pictures(
@@ -154,14 +154,14 @@ def _with_pictures(
         return parts
     _, frame, path = min(paths, key=lambda one: pixels_of(masks, one[1]))
     load, size = image_parts(path, mirrored=True)
-    parts = dataclasses.replace(parts, load_image=load, image_size=size, beside=beside)
+    parts = replace(parts, load_image=load, image_size=size, beside=beside)
     person, share = masks.get(frame), pixels_of(masks, frame) / (SIZE[0] * SIZE[1])
     if person is not None:
         hidden = with_reference_people(parts.people, Instances((person,), SIZE, path.name), Path())
-        parts = dataclasses.replace(parts, people=hidden)
+        parts = replace(parts, people=hidden)
     said = f"has people on {share:.1%} of it" if frame in masks else "has no mask of people"
     note = f"the reference image is frame {frame}, the emptiest: it {said}"
-    return dataclasses.replace(parts, notes=(*parts.notes, note))
+    return replace(parts, notes=(*parts.notes, note))
 
 
 def _tracks(recordings: Sequence[Recording]) -> dict[str, int]:
@@ -202,9 +202,7 @@ def _joined(
 ) -> Bodies | None:
     """Bodies of all recordings together, each person under the own track."""
     parts = [
-        dataclasses.replace(
-            found, person=torch.full_like(found.person, tracks[line.recording.subject])
-        )
+        replace(found, person=torch.full_like(found.person, tracks[line.recording.subject]))
         for line, found in given
         if found is not None
     ]
@@ -241,7 +239,7 @@ def _with_truth(parts: Parts, lines: Sequence[Timeline], lens: At, hints: Hints)
         if mosh is not None:
             true_bodies = _into_camera(mosh, root, cam2world)
             beside["truth/bodies.npz"] = partial(write_bodies, true_bodies)
-    return dataclasses.replace(parts, notes=tuple(notes), beside=beside)
+    return replace(parts, notes=tuple(notes), beside=beside)
 
 
 def _true_scenes(
@@ -260,7 +258,7 @@ def _true_scenes(
     if scan is not None and boxes:
         back = np.linalg.inv(cam2world)
         verts = scan.verts.double().numpy() @ back[:3, :3].T + back[:3, 3]
-        seen = dataclasses.replace(scan, verts=torch.from_numpy(verts).float())
+        seen = replace(scan, verts=torch.from_numpy(verts).float())
         scenes["truth_scan"] = boxes_scene(boxes, from_camera, camera, ground, seen)
     return scenes
 
@@ -271,4 +269,4 @@ def _into_camera(bodies: Bodies, root: Path, cam2world: Matrix) -> Bodies:
     R = torch.from_numpy(matrix[:3, :3]).to(bodies.verts)
     t = torch.from_numpy(matrix[:3, 3]).to(bodies.verts)
     joints = None if bodies.joints is None else bodies.joints @ R.mT + t
-    return dataclasses.replace(bodies, verts=bodies.verts @ R.mT + t, joints=joints, pose=None)
+    return replace(bodies, verts=bodies.verts @ R.mT + t, joints=joints, pose=None)

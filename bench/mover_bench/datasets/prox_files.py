@@ -101,10 +101,8 @@ class Timeline:
     """Which frame of the capture each file of a recording is."""
 
     recording: Recording
-    frames: Mapping[str, int]
-    """By the name of the picture, without its ending."""
-    stills: bool
-    """Each frame is a shot of its own, at a time of its own."""
+    frames: Mapping[str, int]  #: by the name of the picture, without its ending
+    stills: bool  #: each frame is a shot of its own, at a time of its own
 
     def files(self, kind: str) -> dict[int, Path]:
         """The files or folders of one kind of `FOLDERS` by frame, ascending."""

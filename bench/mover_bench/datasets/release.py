@@ -35,7 +35,7 @@ from mover.io.scenes.placing import FLIP, Matrix, level_of, load_from, posed
 from mover.io.scenes.total3d import read_shape, total3d_parts
 from mover_bench.datasets.true_boxes import (
     boxes_scene,
-    floor_of,
+    floor_in,
     read_bbox3d,
     read_scan,
     vertical_of,
@@ -251,6 +251,6 @@ def _truth(folder: Path, camera: dict[str, Any], hints: Hints) -> dict[str, Scen
     if file is None:
         return {"truth": boxes_scene(boxes, world, lens, None)}
     scan = read_scan(file)
-    ground = floor_of(scan.verts.double().numpy() @ world[1, :3])
+    ground = floor_in(scan, world)
     inside = boxes_scene(boxes, world, lens, ground, scan)
     return {"truth": boxes_scene(boxes, world, lens, ground), "truth_scan": inside}

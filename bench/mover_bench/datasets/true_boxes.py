@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mover.core.errors import InputError
 from mover.core.types import Mesh, Scene
+from mover.geometry.mesh import used
 from mover.io.capture.camera_file import camera_of
 from mover.io.capture.scene_file import scene_of, scene_tree
 from mover.io.files.fields import At
@@ -39,8 +40,7 @@ class TrueBox:
     category: str
     center: Matrix
     half: Matrix
-    axes: Matrix
-    """Its axes as rows, in the order of `half`."""
+    axes: Matrix  #: its axes as rows, in the order of `half`
 
 
 def read_bbox3d(path: Path, names: Mapping[str, str], file: At) -> list[TrueBox]:
@@ -128,7 +128,8 @@ def boxes_scene(
         row = {"id": name, "category": box.category, "mesh": name, "scale": [1.0, 1.0, 1.0]}
         rows.append({**row, "translation": place.tolist(), "yaw": yaw, "support": "free"})
     lens = camera_of(At(dict(camera), "camera"))
-    return scene_of(scene_tree(rows, "truth", ground), partial(load_from, meshes), lens, _silent)[0]
+    tree, load = scene_tree(rows, "truth", ground), partial(load_from, meshes)
+    return scene_of(tree, load, lens, lambda _: None)[0]
 
 
 def floor_in(scan: Mesh, world: Matrix) -> float:
@@ -142,10 +143,6 @@ def without_floor(scan: Mesh, world: Matrix, ground: float) -> Mesh:
     low: NDArray[np.bool_] = np.abs(heights) < FLOOR
     faces = scan.faces.numpy()
     return dataclasses.replace(scan, faces=torch.from_numpy(faces[~low[faces].all(1)]))
-
-
-def _silent(text: str) -> None:
-    del text
 
 
 def _upright(axes: Matrix) -> tuple[list[int], Matrix, float]:
@@ -173,9 +170,7 @@ def _inside(scan: Mesh, box: TrueBox, order: Sequence[int], signs: Matrix) -> Me
     faces = faces[within[faces].all(1)]
     if len(faces) < LEAST:
         return None
-    kept, flat = np.unique(faces, return_inverse=True)
-    verts = torch.from_numpy(np.ascontiguousarray(local[kept])).float()
-    return Mesh(verts, torch.from_numpy(flat.reshape(-1, 3)))
+    return used(Mesh(torch.from_numpy(local).float(), torch.from_numpy(faces)))
 
 
 # Scans of rooms and their floors.

@@ -17,6 +17,7 @@ from typing import Any
 import torch
 
 from mover import __version__
+from mover.app.batch import read_tree
 from mover.core import records
 from mover.core.files import replacing
 from mover.core.run import Run, sources
@@ -27,10 +28,9 @@ from mover_bench.experiment.measures import Judge, Trial, under_camera
 from mover_bench.experiment.sets import RoomSet, changed, set_named
 from mover_bench.experiment.variants import VARIANTS, Variant, withheld
 from mover_bench.rooms.camera_path import filmed
-from mover_bench.rooms.known import KnownRoom
+from mover_bench.rooms.known import KnownRoom, make_room
 from mover_bench.rooms.moved import make_moved_room
 from mover_bench.rooms.noise import without_seat
-from mover_bench.rooms.room import make_room
 
 
 def true_room(seed: int, rooms: RoomSet) -> KnownRoom:
@@ -63,17 +63,9 @@ def path_of(out: Path, rooms: str, seed: int, name: str) -> Path:
     return out / rooms / str(seed) / f"{name}.json"
 
 
-def read_numbers(path: Path) -> dict[str, Any]:
-    """What a variant has left; empty where there is nothing or it was cut short."""
-    try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError):
-        return {}
-
-
 def is_finished(out: Path, rooms: str, seed: int, name: str) -> bool:
     """Whether numbers of this version are there."""
-    found = read_numbers(path_of(out, rooms, seed, name))
+    found = read_tree(path_of(out, rooms, seed, name))
     return "full" in found and found["key"] == key_of(set_named(rooms), seed, VARIANTS[name])
 
 

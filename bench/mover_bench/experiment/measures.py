@@ -28,11 +28,9 @@ SURFACE = 4000  # points that give the height of a seat
 class Trial:
     """A known room as the method gets it, and the truth."""
 
-    capture: Capture
-    """With noise."""
+    capture: Capture  #: with noise
     truth: Scene
-    bodies: Bodies | None
-    """The true people."""
+    bodies: Bodies | None  #: the true people
     used: tuple[bool, ...] = ()
     """Which true objects people sit or lie on, lean on or lay a hand on."""
 

@@ -47,16 +47,12 @@ class TableJob:
     """One process of a table."""
 
     capture: Path
-    out: Path
-    """Folder of all results."""
+    out: Path  #: folder of all results
     preset: str
-    name: str
-    """A variant of `paper_rows.variants`."""
-    steps: int = 0
-    """At most so many steps of each descent; 0: as many as the preset has."""
+    name: str  #: a variant of `paper_rows.variants`
+    steps: int = 0  #: at most so many steps of each descent; 0: as many as the preset has
     device: Choice = "cpu"
-    vposer: str = ""
-    """VPoser's weights: the bodies of the rows of people are fitted with them."""
+    vposer: str = ""  #: VPoser's weights: the bodies of the rows of people are fitted with them
 
     @property
     def words(self) -> tuple[str, ...]:

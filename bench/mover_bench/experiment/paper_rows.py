@@ -25,14 +25,10 @@ class TableRow:
     """A row of ours."""
 
     label: str
-    job: str
-    """Name of its job, or its first words where a row is the mean of several."""
-    stage: str = "full"
-    """initial, image or full."""
-    protocol: str = ""
-    """How the paper made it, and what is done here."""
-    detected: bool = False
-    """On the captures with detected boxes and masks."""
+    job: str  #: name of its job, or its first words where a row is the mean of several
+    stage: str = "full"  #: initial, image or full
+    protocol: str = ""  #: how the paper made it, and what is done here
+    detected: bool = False  #: on the captures with detected boxes and masks
 
 
 def variants(preset: str) -> dict[str, Variant]:
@@ -182,13 +178,10 @@ class PaperTable:
     """The tables of one data set."""
 
     title: str
-    expected: str
-    """On what the paper measures."""
-    count: int
-    """Recordings of it."""
+    expected: str  #: on what the paper measures
+    count: int  #: recordings of it
     parts: tuple[Part, ...]
-    factor: float = 1.0
-    """On the overlaps: the paper prints some in percent."""
+    factor: float = 1.0  #: on the overlaps: the paper prints some in percent
 
 
 STD = "iou3d_std"

@@ -11,6 +11,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from mover.app.batch import last_line, read_tree
 from mover.core.errors import InputError
 from mover.core.files import replacing
 from mover.core.observe import Observer, Step, silent
@@ -18,7 +19,6 @@ from mover.energy.config import Adam
 from mover.pipeline.presets import PRESETS
 from mover_bench.cli import TableArgs
 from mover_bench.datasets import prox_files
-from mover_bench.experiment.job import read_numbers
 from mover_bench.experiment.paper_job import DONE, TableJob, fits_of, key_of
 from mover_bench.experiment.paper_rows import (
     BASELINE,
@@ -34,7 +34,7 @@ from mover_bench.experiment.paper_rows import (
     variants,
 )
 from mover_bench.experiment.run import Pool, run_each
-from mover_bench.experiment.tables import LOG, last_line, markdown
+from mover_bench.experiment.tables import LOG, markdown
 
 MILLIMETRES = 1000.0
 SHORT = {
@@ -96,7 +96,7 @@ def planned(args: TableArgs) -> str:
     """How many jobs there are, and about how long they take: as those that have ended, if any."""
     every = _once(all_jobs(args))
     waiting = [job for job in every if not is_finished(job)]
-    known = [read_numbers(job.folder / DONE).get("seconds") for job in every if job not in waiting]
+    known = [read_tree(job.folder / DONE).get("seconds") for job in every if job not in waiting]
     times = [seconds for seconds in known if seconds is not None and seconds > FEW]
     usual = statistics.mean(times) if times else None
     hours = sum(_seconds(job, usual) for job in waiting) / 3600
@@ -156,7 +156,7 @@ def belongs(name: str, table: str) -> bool:
 
 def is_finished(job: TableJob) -> bool:
     """Whether its results are there, of these inputs and this version."""
-    return read_numbers(job.folder / DONE).get("key") == key_of(job)
+    return read_tree(job.folder / DONE).get("key") == key_of(job)
 
 
 def write_page(table: PaperTable, jobs: Jobs, args: TableArgs) -> Path:
@@ -200,7 +200,7 @@ def _values(
     row: TableRow, jobs: Sequence[TableJob], part: Part, table: PaperTable
 ) -> dict[str, float]:
     """Means over the recordings of what is finished, in the units of the table."""
-    trees = {job: read_numbers(job.folder / DONE) for job in jobs}
+    trees = {job: read_tree(job.folder / DONE) for job in jobs}
     found = [tree[row.stage] for tree in trees.values() if tree.get(row.stage)]
     for tree in found:
         if "pitch_error" in tree:
@@ -242,8 +242,7 @@ def _laid_out(
 
 def _failures(jobs: Jobs) -> list[str]:
     """What is not there, so that nothing is left out silently."""
-    every = dict.fromkeys(job for found in jobs.values() for job in found)
-    lacking = [job for job in every if not read_numbers(job.folder / DONE)]
+    lacking = [job for job in _once(jobs) if not read_tree(job.folder / DONE)]
     failed = [job for job in lacking if (job.folder / LOG).is_file()]
     lines = [
         f"**Failed**: {job.capture.name}, {job.name}: {last_line(job.folder / LOG)}"

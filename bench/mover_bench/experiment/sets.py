@@ -16,16 +16,12 @@ from mover_bench.rooms.config import ActConfig, NoiseConfig, PathConfig, PlanCon
 class RoomSet:
     """Rooms of one kind, with one kind of noise."""
 
-    about: str
-    """What it holds, in a sentence."""
-    seeds: str
-    """Held-out rooms, for results: `1000-1029`."""
-    development: str
-    """Rooms to choose settings on; none is held out."""
+    about: str  #: what it holds, in a sentence
+    seeds: str  #: Held-out rooms, for results: `1000-1029`
+    development: str  #: rooms to choose settings on; none is held out
     room: RoomConfig = field(default_factory=RoomConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
-    withheld: Literal["seat"] | None = None
-    """What no detector saw: `rooms.noise.without_seat`."""
+    withheld: Literal["seat"] | None = None  #: what no detector saw: `rooms.noise.without_seat`
     paths: tuple[PathConfig, ...] = (PathConfig(),)
     """How the camera moves, one room after the other."""
 
@@ -127,10 +123,8 @@ SETS: dict[str, RoomSet] = {
 class Change:
     """An error of the input in growing sizes."""
 
-    field: str
-    """Of `NoiseConfig`: set to the level."""
-    levels: tuple[float, ...]
-    """Studied sizes; the first is no error of this kind."""
+    field: str  #: of `NoiseConfig`: set to the level
+    levels: tuple[float, ...]  #: studied sizes; the first is no error of this kind
     without: str = ""
     """Another field that is zero then, so that this error is the only one of its kind."""
 

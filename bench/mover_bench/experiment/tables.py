@@ -13,13 +13,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mover.app.batch import last_line, read_tree
 from mover.app.report.tables import SHOWN, shown
 from mover.bodies.skinning import heights_of, open_body
 from mover.core.files import replacing
 from mover.core.records import plain
 from mover.evaluate.evaluation import METRICS
 from mover_bench.cli import ExperimentArgs
-from mover_bench.experiment.job import path_of, read_numbers
+from mover_bench.experiment.job import path_of
 from mover_bench.experiment.sets import set_named
 from mover_bench.experiment.variants import VARIANTS
 
@@ -88,22 +89,14 @@ def interval(values: Sequence[float] | Float[np.ndarray, " rooms"], seed: int = 
     return Interval(float(data.mean()), float(low), float(high), len(data))
 
 
-def last_line(log: Path) -> str:
-    """What a process said last."""
-    lines = log.read_text(errors="replace").split("\n") if log.is_file() else []
-    return next((line.strip() for line in reversed(lines) if line.strip()), "it said nothing")
-
-
 @dataclass(frozen=True)
 class Finished:
     """What an experiment has found so far."""
 
     scenes: Frame
     """A row for each seed, variant (`name`, its table `row`) and stage, with all metrics."""
-    objects: Frame
-    """The same for each object, with what it is."""
-    lacking: Mapping[tuple[int, str], str]
-    """Why there are no numbers, by seed and variant."""
+    objects: Frame  #: the same for each object, with what it is
+    lacking: Mapping[tuple[int, str], str]  #: why there are no numbers, by seed and variant
     versions: tuple[str, ...]
 
 
@@ -115,7 +108,7 @@ def read_finished(out: Path, rooms: str, seeds: Sequence[int], names: Sequence[s
     lacking: dict[tuple[int, str], str] = {}
     versions: set[str] = set()
     for seed, name in ((seed, name) for seed in seeds for name in names):
-        tree = read_numbers(path_of(out, rooms, seed, name))
+        tree = read_tree(path_of(out, rooms, seed, name))
         if "full" not in tree:
             log = out / rooms / str(seed) / LOG
             reason = tree["failed"].strip().split("\n")[-1] if "failed" in tree else last_line(log)

@@ -28,10 +28,8 @@ NO_TERM = "no-term"
 class Cut:
     """Which part of a video is given."""
 
-    seconds: float = 0.0
-    """Length of a segment [s]; 0: a single frame."""
-    start: float = 0.0
-    """Where it starts: 0 as early, 1 as late as possible."""
+    seconds: float = 0.0  #: length of a segment [s]; 0: a single frame
+    start: float = 0.0  #: where it starts: 0 as early, 1 as late as possible
 
 
 @dataclass(frozen=True)
@@ -41,12 +39,9 @@ class Variant:
     config: Config
     given: Given = "all"
     """What of the people is given: `no contact`: they touch nothing; `no people`: an image."""
-    cut: Cut | None = None
-    """Part of the video; None: all of it."""
-    change: str = ""
-    """An error of the input in another size, such as `scale=0.25`."""
-    refined: bool = False
-    """The room refines the people before anything is measured."""
+    cut: Cut | None = None  #: part of the video; None: all of it
+    change: str = ""  #: an error of the input in another size, such as `scale=0.25`
+    refined: bool = False  #: the room refines the people before anything is measured
     row: str = ""
     """Row of the tables that is the mean over several variants; empty: the variant's own name."""
 

@@ -5,7 +5,7 @@ same as under the static camera, so that results can be compared room by room. W
 the path in another scale, with a drift that grows with the way.
 """
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -37,7 +37,7 @@ def filmed(room: KnownRoom, noise: NoiseConfig, seed: int, config: PathConfig) -
     assert fps is not None, "a known room is a video"
     true = draw_path(frames, fps, config, rng)
     capture = add_noise(on_the_way(room, true), noise, seed)
-    return dataclasses.replace(capture, path=slam_path(true, config, rng))
+    return replace(capture, path=slam_path(true, config, rng))
 
 
 def draw_path(frames: int, fps: float, config: PathConfig, rng: np.random.Generator) -> CameraPath:
@@ -93,7 +93,7 @@ def on_the_way(room: KnownRoom, path: CameraPath) -> KnownRoom:
     back = poses.R_reference_camera.mT, poses.t_reference_camera
     shift = -(back[0] @ back[1][..., None])[..., 0]
     assert bodies.joints is not None, "a known room has joints"
-    seen = dataclasses.replace(
+    seen = replace(
         bodies,
         verts=rounded(from_reference(bodies.verts, poses)),
         joints=rounded(from_reference(bodies.joints, poses)),
@@ -107,5 +107,5 @@ def on_the_way(room: KnownRoom, path: CameraPath) -> KnownRoom:
         return first_hit(points, faces, camera.K, (camera.height, camera.width))[0]
 
     shown = visible(room.plan, seen, depth)
-    capture = dataclasses.replace(room.capture, bodies=seen, people=shown.people)
-    return dataclasses.replace(room, bodies=seen, capture=capture, whole=shown.whole)
+    capture = replace(room.capture, bodies=seen, people=shown.people)
+    return replace(room, bodies=seen, capture=capture, whole=shown.whole)

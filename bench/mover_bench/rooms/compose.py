@@ -4,8 +4,8 @@ Pieces stand along a wall, around a table, in the middle of a room; how much of 
 counted in a small picture without people.
 """
 
-import dataclasses
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -112,8 +112,7 @@ class Viewpoint:
     """The camera over the floor: it stands at x = z = 0."""
 
     camera: Camera
-    height: float
-    """Above the floor [m]."""
+    height: float  #: above the floor [m]
 
     def seen(self, points: Float[Tensor, "points 3"]) -> Float[Tensor, "points 3"]:
         """Points in the frame of the floor in camera axes [m]."""
@@ -150,10 +149,8 @@ class Plan:
 
     pieces: tuple[Placed, ...]
     view: Viewpoint
-    low: tuple[float, float]
-    """Smallest x and z of the floor [m]."""
-    high: tuple[float, float]
-    """Largest x and z of the floor [m]."""
+    low: tuple[float, float]  #: smallest x and z of the floor [m]
+    high: tuple[float, float]  #: largest x and z of the floor [m]
 
     @property
     def walls(self) -> Float[np.ndarray, "2 2"]:
@@ -258,7 +255,7 @@ def _furnished(
         best = int(np.argmax(values)) if values else -1
         if best >= 0 and values[best] >= 0:
             drawn, value = [*drawn, looks[best]], values[best]
-            plan = dataclasses.replace(plan, pieces=(*plan.pieces, spots[best]))
+            plan = replace(plan, pieces=(*plan.pieces, spots[best]))
     return plan, value
 
 

@@ -13,9 +13,8 @@ from mover.core.records import rows_of
 from mover.core.types import BodyPose
 from mover.io.capture.folder import write_capture
 from mover_bench.rooms.config import NoiseConfig
-from mover_bench.rooms.known import in_camera
+from mover_bench.rooms.known import demo_plan, demo_room, in_camera
 from mover_bench.rooms.noise import add_noise, noisy_pose
-from mover_bench.rooms.room import demo_plan, demo_room
 
 SEED = 0  # of the noise
 

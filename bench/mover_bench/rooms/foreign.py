@@ -12,8 +12,6 @@ one of several makers, so that no one style of errors is learnt:
 Then the mesh is warped by a few per cent of its size, and some lose what a camera does not see.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -22,8 +20,8 @@ from mover.core.types import Mesh
 from mover.furniture.library import another
 from mover.furniture.pieces import Furniture
 from mover.geometry.mesh import face_normals, fit_box, used
+from mover.geometry.topology import Triangles, level_set
 
-Triangles = tuple[np.ndarray, np.ndarray]
 KNOTS = 4  # stretches along each axis that change their share of the size
 PROPORTION = 0.2  # by which a stretch grows or shrinks, drawn evenly
 TORN = 0.4  # share of meshes without what faces down or back
@@ -91,10 +89,7 @@ def _grid(
         field = np.where(field < level, -1.0, 1.0)
         level = 0.2
     field = gaussian_filter(field, blur)
-    points, shell, _ = igl.marching_cubes(
-        np.ascontiguousarray(field.ravel()), places, *counts.tolist(), isovalue=level
-    )
-    return np.asarray(points), np.asarray(shell)
+    return level_set(field.transpose(2, 1, 0), start, cell, level)
 
 
 def _smooth(mesh: Triangles, rng: np.random.Generator) -> Triangles:
@@ -143,10 +138,5 @@ def _soup(mesh: Triangles, rng: np.random.Generator) -> Triangles:
     return np.asarray(verts), np.concatenate([faces, twice[:, ::-1]])
 
 
-MAKERS: tuple[Callable[[Triangles, np.random.Generator], Triangles], ...] = (
-    _smooth,
-    _blocky,
-    _sphere,
-    _soup,
-)
+MAKERS = (_smooth, _blocky, _sphere, _soup)
 """The ways in which other programs make a mesh."""

@@ -28,10 +28,8 @@ class Steps:
     """Where the feet land; the first two rows are where they stood, left then right."""
 
     side: Int[np.ndarray, " steps"]
-    place: Float[np.ndarray, "steps 2"]
-    """x and z of the ankle [m]."""
-    heading: Float[np.ndarray, " steps"]
-    """Of the foot [rad]."""
+    place: Float[np.ndarray, "steps 2"]  #: x and z of the ankle [m]
+    heading: Float[np.ndarray, " steps"]  #: of the foot [rad]
 
 
 @record

@@ -26,18 +26,12 @@ class Task:
     """One thing to do."""
 
     kind: Literal["walk", "sit", "lean", "lie", "table"]
-    piece: int = -1
-    """Index of the piece; -1 for a walk."""
-    goal: tuple[float, float] = (0.0, 0.0)
-    """Where to walk (x, z) [m]."""
-    seconds: float = 5.0
-    """How long to stay [s]."""
-    side: int = 1
-    """Lying: from which side; at a table: 0 front, 1 left, 2 back, 3 right."""
-    along: float = 0.0
-    """Offset along the edge [m]."""
-    roll: bool = False
-    """Lying: turn onto the side and back."""
+    piece: int = -1  #: index of the piece; -1 for a walk
+    goal: tuple[float, float] = (0.0, 0.0)  #: where to walk (x, z) [m]
+    seconds: float = 5.0  #: how long to stay [s]
+    side: int = 1  #: lying: from which side; at a table: 0 front, 1 left, 2 back, 3 right
+    along: float = 0.0  #: offset along the edge [m]
+    roll: bool = False  #: lying: turn onto the side and back
 
 
 @record
@@ -55,8 +49,7 @@ class Stop:
 
     place: Float[np.ndarray, "2"]
     heading: float
-    door: Float[np.ndarray, "2"]
-    """Where one turns before and after."""
+    door: Float[np.ndarray, "2"]  #: where one turns before and after
 
 
 @record
@@ -65,8 +58,7 @@ class Stage:
 
     person: Person
     pieces: tuple[Placed, ...]
-    bounds: Float[np.ndarray, "2 2"]
-    """Smallest and largest x and z that one may walk [m]."""
+    bounds: Float[np.ndarray, "2 2"]  #: smallest and largest x and z that one may walk [m]
     fps: float
 
 
@@ -76,8 +68,7 @@ class Performance:
 
     posture: Posture
     labels: tuple[str, ...]
-    touched: tuple[int, ...]
-    """Index of the piece in use in each frame, or -1."""
+    touched: tuple[int, ...]  #: index of the piece in use in each frame, or -1
     refused: tuple[str, ...]
 
 

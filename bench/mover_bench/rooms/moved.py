@@ -5,8 +5,8 @@ the second visitor comes after the piece was moved. How the objects look in the 
 a segmenter that tracks them would give it.
 """
 
-import dataclasses
 import math
+from dataclasses import fields, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -18,10 +18,17 @@ from mover.core.types import Bodies, BodyPose, Masks, People, Scene, Segment
 from mover.geometry.rle import decode, joined
 from mover_bench.rooms.compose import Plan, fits, in_view
 from mover_bench.rooms.config import RoomConfig
-from mover_bench.rooms.known import KnownRoom, NoRoomError, RefusedError, build, one_thread
+from mover_bench.rooms.known import (
+    KnownRoom,
+    NoRoomError,
+    RefusedError,
+    build,
+    cast,
+    make_room,
+    one_thread,
+)
 from mover_bench.rooms.placed import Placed
 from mover_bench.rooms.render import encode, see
-from mover_bench.rooms.room import cast, make_room
 
 MOVABLE = ("chair", "office chair", "stool", "armchair", "table", "coffee table")
 GAP = 10  # frames in which the room is empty, and in the middle of which the piece is moved
@@ -67,7 +74,7 @@ def _moved(plan: Plan, index: int, rng: np.random.Generator) -> Plan:
         there = Placed(piece.id, piece.furniture, (float(x), float(z)), piece.heading + turn)
         if fits(there, others, 0.3, plan.walls) and in_view(there, plan.view) >= 0.95:
             pieces = tuple(there if k == index else p for k, p in enumerate(plan.pieces))
-            return dataclasses.replace(plan, pieces=pieces)
+            return replace(plan, pieces=pieces)
     raise RefusedError(f"{piece.id} has nowhere to go")
 
 
@@ -75,38 +82,36 @@ def _joined(first: KnownRoom, second: KnownRoom, index: int) -> KnownRoom:
     """One video of both."""
     later = int(first.bodies.frame.max()) + 1 + GAP
     change, people = later - GAP // 2, 1 + int(first.bodies.person.max())
-    second = dataclasses.replace(
+    second = replace(
         second,
         bodies=_shifted(second.bodies, later, people),
-        capture=dataclasses.replace(
-            second.capture, people=_shifted(second.capture.people, later, people)
-        ),
+        capture=replace(second.capture, people=_shifted(second.capture.people, later, people)),
     )
     end = int(second.bodies.frame.max()) + 1
     before, after = range(0, change, EVERY), range(change + change % EVERY, end, EVERY)
     truth = _scene(first.truth, second.truth, index, change)
     both = _both(first, second)
-    capture = dataclasses.replace(
+    capture = replace(
         first.capture,
         bodies=both.bodies,
         people=_both(first.capture.people, second.capture.people),
         furniture=_both(_seen(first, before), _seen(second, after)),
     )
     actions = (*first.actions, *second.actions)
-    return dataclasses.replace(both, capture=capture, truth=truth, actions=actions)
+    return replace(both, capture=capture, truth=truth, actions=actions)
 
 
 def _shifted(rows: Rows, frames: int, people: int) -> Rows:
     """The same later, and other people."""
     moved: Any = rows
-    return dataclasses.replace(moved, frame=moved.frame + frames, person=moved.person + people)
+    return replace(moved, frame=moved.frame + frames, person=moved.person + people)
 
 
 def _both(first: Rows, second: Rows) -> Rows:
     """The rows of one record after those of the other; what has no rows is the first's."""
     some: Any = first
     found: dict[str, Any] = {}
-    for field in dataclasses.fields(some):
+    for field in fields(some):
         a, b = getattr(first, field.name), getattr(second, field.name)
         axis = axis_of(field.type, ("bodies", "rows"))
         if isinstance(a, Tensor) and axis is not None:
@@ -115,7 +120,7 @@ def _both(first: Rows, second: Rows) -> Rows:
             found[field.name] = joined([a, b])
         elif isinstance(a, Bodies | BodyPose):
             found[field.name] = _both(a, b)
-    return dataclasses.replace(some, **found)
+    return replace(some, **found)
 
 
 def _seen(room: KnownRoom, frames: range) -> People:
@@ -143,5 +148,5 @@ def _scene(first: Scene, second: Scene, index: int, change: int) -> Scene:
         for frame, scene in ((0, first), (change, second))
     )
     pieces = list(first.objects)
-    pieces[index] = dataclasses.replace(pieces[index], segments=segments)
-    return dataclasses.replace(first, objects=tuple(pieces))
+    pieces[index] = replace(pieces[index], segments=segments)
+    return replace(first, objects=tuple(pieces))

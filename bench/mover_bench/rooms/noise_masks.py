@@ -3,8 +3,8 @@
 An initial scene has one object for each detection, so that the scene follows the detections.
 """
 
-import dataclasses
 from collections.abc import Collection
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -91,7 +91,7 @@ def leaking(
 
 def redrawn(detection: Detection, mask: Bool[np.ndarray, "h w"]) -> Detection:
     """The detection with another mask and its box."""
-    return dataclasses.replace(detection, mask=encode([mask]), box=box_of_mask(mask))
+    return replace(detection, mask=encode([mask]), box=box_of_mask(mask))
 
 
 def _mask(detection: Detection) -> Bool[np.ndarray, "h w"]:
@@ -133,9 +133,9 @@ def noisy_finds(capture: Capture, floor: float, noise: NoiseConfig, seed: list[i
 def without(capture: Capture, lost: Collection[int | None]) -> Capture:
     """The capture without what some detections show: neither they nor their objects."""
     pieces = tuple(p for p in capture.scene.objects if p.annotation not in lost)
-    return dataclasses.replace(
+    return replace(
         capture,
-        scene=dataclasses.replace(capture.scene, objects=pieces),
+        scene=replace(capture.scene, objects=pieces),
         detections=tuple(d for d in capture.detections if d.id not in lost),
     )
 
@@ -156,7 +156,7 @@ def _merged(capture: Capture, share: float, rng: np.random.Generator) -> Capture
         mask = _mask(found[one.id]) | _mask(found[other])
         found[one.id] = redrawn(one, mask)
         gone.add(other)
-    capture = dataclasses.replace(capture, detections=tuple(found.values()))
+    capture = replace(capture, detections=tuple(found.values()))
     return without(capture, gone)
 
 
@@ -184,11 +184,11 @@ def _renamed(capture: Capture, share: float, rng: np.random.Generator) -> Captur
             verts = piece.mesh.verts
             mesh = fit_box(new.mesh, verts.amin(0), verts.amax(0))
             names[piece.annotation] = new.category
-            piece = dataclasses.replace(piece, category=new.category, mesh=mesh)
+            piece = replace(piece, category=new.category, mesh=mesh)
         pieces.append(piece)
-    found = [dataclasses.replace(d, category=names[d.id]) for d in capture.detections]
-    scene = dataclasses.replace(capture.scene, objects=tuple(pieces))
-    return dataclasses.replace(capture, scene=scene, detections=tuple(found))
+    found = [replace(d, category=names[d.id]) for d in capture.detections]
+    scene = replace(capture.scene, objects=tuple(pieces))
+    return replace(capture, scene=scene, detections=tuple(found))
 
 
 def _with_false(capture: Capture, index: int, floor: float, rng: np.random.Generator) -> Capture:
@@ -209,8 +209,8 @@ def _with_false(capture: Capture, index: int, floor: float, rng: np.random.Gener
     if not patch.any():
         return capture
     found = Detection(number, new.category, box_of_mask(patch), encode([patch]), 0.6)
-    scene = dataclasses.replace(capture.scene, objects=(*capture.scene.objects, piece))
-    return dataclasses.replace(capture, scene=scene, detections=(*capture.detections, found))
+    scene = replace(capture.scene, objects=(*capture.scene.objects, piece))
+    return replace(capture, scene=scene, detections=(*capture.detections, found))
 
 
 # Masks as networks draw them: by a coarse head in a wrong box, of what is hidden, wobbling.
@@ -243,7 +243,7 @@ def headed(
         drawn = coarse(mask, box, cells) if cells else mask
         mask = drawn if drawn.any() else mask
         found = box_of_mask(mask) if not noise.mask_box else torch.from_numpy(box).float()
-        out.append(dataclasses.replace(one, mask=encode([mask]), box=found))
+        out.append(replace(one, mask=encode([mask]), box=found))
     return tuple(out)
 
 
@@ -287,7 +287,7 @@ def wobbling(people: People | None, pixels: float, rng: np.random.Generator) -> 
         return people
     count = len(people.frame)
     masks = [wobbled(decode(people.masks, k).numpy(), pixels, rng) for k in range(count)]
-    return dataclasses.replace(people, masks=encode(masks)) if masks else people
+    return replace(people, masks=encode(masks)) if masks else people
 
 
 def wobbled(

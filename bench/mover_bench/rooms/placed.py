@@ -20,14 +20,8 @@ class Placed:
 
     id: str
     furniture: Furniture
-    at: tuple[float, float]
-    """x and z of the centre of the base [m]."""
-    heading: float
-    """Rotation about +y; 0 faces +z, towards the camera [rad]."""
-    height: float = 0.0
-    """Of what it stands on [m]."""
-    support: str = "ground"
-    """Id of what it stands on."""
+    at: tuple[float, float]  #: x and z of the centre of the base [m]
+    heading: float  #: rotation about +y; 0 faces +z, towards the camera [rad]
 
     @property
     def place(self) -> Float[np.ndarray, "2"]:
@@ -44,19 +38,11 @@ class Placed:
 class Spot:
     """An edge that one can sit on."""
 
-    edge: Float[np.ndarray, "2"]
-    """A point on the front edge of the seat (x, z) [m]."""
-    heading: float
-    """Where the sitter looks [rad]."""
-    height: float
-    """[m]"""
-    depth: float
-    """From the edge to the backrest, or to the far edge [m]."""
-    lip: float
-    """How far the base stands out under the edge [m]."""
-    has_back: bool
-    piece: int
-    """Index of the piece."""
+    edge: Float[np.ndarray, "2"]  #: a point on the front edge of the seat (x, z) [m]
+    heading: float  #: where the sitter looks [rad]
+    height: float  #: [m]
+    depth: float  #: from the edge to the backrest, or to the far edge [m]
+    lip: float  #: how far the base stands out under the edge [m]
 
 
 def on_floor(piece: Placed, x: float, z: float) -> Float[np.ndarray, "2"]:
@@ -77,9 +63,7 @@ def verts_on_floor(piece: Placed) -> Float[Tensor, "verts 3"]:
     """Vertices in the frame of the floor [m]."""
     verts, (left, front) = piece.furniture.mesh.verts.double().numpy(), piece.axes
     flat = piece.place + verts[:, :1] * left + verts[:, 2:] * front
-    return torch.from_numpy(
-        np.stack([flat[:, 0], verts[:, 1] + piece.height, flat[:, 1]], -1)
-    ).float()
+    return torch.from_numpy(np.stack([flat[:, 0], verts[:, 1], flat[:, 1]], -1)).float()
 
 
 def distances(
@@ -89,7 +73,7 @@ def distances(
     import igl
 
     flat, (left, front) = points[:, [0, 2]] - piece.place, piece.axes
-    local = np.stack([flat @ left, points[:, 1] - piece.height, flat @ front], -1)
+    local = np.stack([flat @ left, points[:, 1], flat @ front], -1)
     verts = piece.furniture.mesh.verts.double().numpy()
     low, high = verts.min(0) - far, verts.max(0) + far
     near = np.flatnonzero(((local > low) & (local < high)).all(-1))

@@ -30,12 +30,9 @@ class Person:
     """One body shape: its skeleton and skin in the T-pose."""
 
     betas: Float[np.ndarray, " shape"]
-    joints: Float[np.ndarray, "55 3"]
-    """[m], relative to the pelvis."""
-    skin: Float[np.ndarray, "verts 3"]
-    """[m], relative to the pelvis."""
-    origin: Float[np.ndarray, "3"]
-    """The pelvis of the rest shape: what `transl` leaves out [m]."""
+    joints: Float[np.ndarray, "55 3"]  #: [m], relative to the pelvis
+    skin: Float[np.ndarray, "verts 3"]  #: [m], relative to the pelvis
+    origin: Float[np.ndarray, "3"]  #: the pelvis of the rest shape: what `transl` leaves out [m]
 
     @property
     def leg(self) -> float:
@@ -85,28 +82,19 @@ REACH = 0.995  # a limb is never quite straight
 class Posture:
     """What the body does in each frame; sides are (left, right)."""
 
-    pelvis: Float[np.ndarray, "frames 3"]
-    """Place of the pelvis [m]."""
-    turn: Float[np.ndarray, "frames 3 3"]
-    """Rotation of the pelvis."""
+    pelvis: Float[np.ndarray, "frames 3"]  #: place of the pelvis [m]
+    turn: Float[np.ndarray, "frames 3 3"]  #: rotation of the pelvis
     spine: Float[np.ndarray, "frames 3"]
     """Forward bend, turn to the left, lean to the right of the trunk [rad]."""
-    head: Float[np.ndarray, "frames 2"]
-    """Nod and turn to the left of the head [rad]."""
-    ankles: Float[np.ndarray, "frames 2 3"]
-    """Places of the ankles [m]."""
-    feet: Float[np.ndarray, "frames 2 3 3"]
-    """Rotations of the feet."""
-    toes: Float[np.ndarray, "frames 2"]
-    """Bend of the toes, up is positive [rad]."""
-    knees: Float[np.ndarray, "frames 2 3"]
-    """Where the knees point."""
+    head: Float[np.ndarray, "frames 2"]  #: nod and turn to the left of the head [rad]
+    ankles: Float[np.ndarray, "frames 2 3"]  #: places of the ankles [m]
+    feet: Float[np.ndarray, "frames 2 3 3"]  #: rotations of the feet
+    toes: Float[np.ndarray, "frames 2"]  #: bend of the toes, up is positive [rad]
+    knees: Float[np.ndarray, "frames 2 3"]  #: where the knees point
     wrists: Float[np.ndarray, "frames 2 3"]
     """Places of the wrists from the shoulders, in the axes of the chest [m]."""
-    elbows: Float[np.ndarray, "frames 2 3"]
-    """Where the elbows point, in the axes of the chest."""
-    palms: Float[np.ndarray, "frames 2 3"]
-    """Places of wrists that rest on something [m]."""
+    elbows: Float[np.ndarray, "frames 2 3"]  #: where the elbows point, in the axes of the chest
+    palms: Float[np.ndarray, "frames 2 3"]  #: places of wrists that rest on something [m]
     resting: Float[np.ndarray, "frames 2"]
     """1: the hand lies flat at `palms`; 0: it follows `wrists`."""
 

@@ -29,24 +29,18 @@ LIGHT = np.array([0.35, 0.85, 0.4]) / np.linalg.norm([0.35, 0.85, 0.4])
 class Sight:
     """Furniture as the camera sees it, without people."""
 
-    depth: Float[Tensor, "h w"]
-    """[m], infinite where there is none."""
-    piece: Int[Tensor, "h w"]
-    """Index of the piece; -1: none."""
-    picture: Float[Tensor, "h w 3"]
-    """A shaded picture with floor and walls, in [0, 1]."""
+    depth: Float[Tensor, "h w"]  #: [m], infinite where there is none
+    piece: Int[Tensor, "h w"]  #: index of the piece; -1: none
+    picture: Float[Tensor, "h w 3"]  #: a shaded picture with floor and walls, in [0, 1]
 
 
 @record
 class Look:
     """One body alone, in a window of the image."""
 
-    window: tuple[slice, slice]
-    """Rows and columns."""
-    depth: Float[Tensor, "h w"]
-    """[m], infinite where there is none."""
-    face: Int[Tensor, "h w"]
-    """-1: none."""
+    window: tuple[slice, slice]  #: rows and columns
+    depth: Float[Tensor, "h w"]  #: [m], infinite where there is none
+    face: Int[Tensor, "h w"]  #: -1: none
 
 
 def encode(masks: Sequence[np.ndarray]) -> Masks:

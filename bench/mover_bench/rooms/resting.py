@@ -1,6 +1,6 @@
 """How people rest on furniture: seated, leaning back, lying, standing with a hand on a table."""
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
 
@@ -34,8 +34,7 @@ def seat_spot(pieces: tuple[Placed, ...], index: int, along: float = 0.0) -> Spo
     seat = piece.furniture
     middle = (seat.seat_left + seat.seat_right) / 2
     edge = on_floor(piece, middle + along, seat.seat_front)
-    back = seat.back_height > 0
-    return Spot(edge, piece.heading, seat.seat_height, seat.seat_depth, 0.0, back, index)
+    return Spot(edge, piece.heading, seat.seat_height, seat.seat_depth, 0.0)
 
 
 def bed_spot(pieces: tuple[Placed, ...], index: int, side: int, along: float) -> Spot:
@@ -45,8 +44,7 @@ def bed_spot(pieces: tuple[Placed, ...], index: int, side: int, along: float) ->
     edge = on_floor(piece, bed.seat_right if side > 0 else bed.seat_left, along)
     width = bed.seat_right - bed.seat_left
     lip = bed.size[0] / 2 - bed.seat_right
-    heading = piece.heading + side * np.pi / 2
-    return Spot(edge, heading, bed.seat_height, width, lip, False, index)
+    return Spot(edge, piece.heading + side * np.pi / 2, bed.seat_height, width, lip)
 
 
 def before(person: Person, spot: Spot) -> np.ndarray:
@@ -77,7 +75,7 @@ def seated(person: Person, spot: Spot, piece: Placed) -> Posture:
 
     def at(height: float) -> Posture:
         pelvis = np.array([[behind[0], height, behind[1]]])
-        return dataclasses.replace(stand, pelvis=pelvis, spine=np.array([[0.06, 0, 0]]))
+        return replace(stand, pelvis=pelvis, spine=np.array([[0.06, 0, 0]]))
 
     top = spot.height + 0.16
     height = approach(lambda y: gap(person, at(y), piece, "core"), top, -1.0, 0.2)
@@ -98,7 +96,7 @@ def hands_on_thighs(person: Person, posture: Posture) -> Posture:
         wrists.append(apply(np.swapaxes(chest, 1, 2), goal - shoulders[:, k]))
     frames = len(posture.pelvis)
     elbows = np.broadcast_to([[0.45, -0.3, -0.8], [-0.45, -0.3, -0.8]], (frames, 2, 3)).copy()
-    return dataclasses.replace(posture, wrists=np.stack(wrists, 1), elbows=elbows)
+    return replace(posture, wrists=np.stack(wrists, 1), elbows=elbows)
 
 
 def sit_down(person: Person, end: Posture, heading: float, share: np.ndarray) -> Posture:
@@ -114,7 +112,7 @@ def sit_down(person: Person, end: Posture, heading: float, share: np.ndarray) ->
     turn = down.turn @ about(X, 0.5 * bow)
     spine = down.spine + np.stack([0.6 * bow, 0 * bow, 0 * bow], -1)
     pelvis = np.stack([flat[:, 0], high[:, 1], flat[:, 2]], -1)
-    return dataclasses.replace(down, pelvis=pelvis, turn=turn, spine=spine)
+    return replace(down, pelvis=pelvis, turn=turn, spine=spine)
 
 
 def leaning(person: Person, sitting: Posture, piece: Placed) -> Posture:
@@ -122,7 +120,7 @@ def leaning(person: Person, sitting: Posture, piece: Placed) -> Posture:
 
     def at(angle: float, drop: float = 0.0) -> Posture:
         down = sitting.pelvis - np.array([[0.0, drop, 0.0]])
-        return dataclasses.replace(
+        return replace(
             sitting, pelvis=down, turn=sitting.turn @ about(X, np.array([-0.45 * angle])),
             spine=sitting.spine - np.array([[0.55 * angle, 0, 0]]),
             head=sitting.head + np.array([[0.5 * angle, 0]]),
@@ -145,9 +143,7 @@ def settle_down(still: Posture, times: np.ndarray, phase: float, amount: float) 
     spine = posture.spine + amount * np.stack([0.03 * mid, 0.08 * slow, 0 * slow], -1)
     head = posture.head + np.stack([0.06 * mid, 0.3 * slow], -1)
     wave = np.stack([slow, mid], -1)[..., None] * np.array([0.0, 0.01, 0.02])
-    return dataclasses.replace(
-        posture, spine=spine, head=head, wrists=posture.wrists + np.abs(wave)
-    )
+    return replace(posture, spine=spine, head=head, wrists=posture.wrists + np.abs(wave))
 
 
 # Standing at a table with a hand on it.
@@ -184,7 +180,7 @@ def hand_on(person: Person, place: np.ndarray, heading: float, piece: Placed, ha
     def bent(angle: float) -> Posture:
         back = -np.sin(angle) * np.array([0.25 * ahead[0], 0.05, 0.25 * ahead[1]])
         lean = -0.4 if hand == 0 else 0.4
-        return dataclasses.replace(
+        return replace(
             stand, pelvis=stand.pelvis + back[None],
             turn=stand.turn @ about(X, np.array([0.45 * angle])),
             spine=stand.spine + angle * np.array([[0.55, 0, lean]]),
@@ -202,7 +198,7 @@ def hand_on(person: Person, place: np.ndarray, heading: float, piece: Placed, ha
 
     def touching(rise: float) -> Posture:
         palms[0, hand] = goal + np.array([0.0, rise, 0.0])
-        return dataclasses.replace(bent(angle), palms=palms.copy(), resting=resting)
+        return replace(bent(angle), palms=palms.copy(), resting=resting)
 
     name = HANDS[hand]
     return touching(approach(lambda y: gap(person, touching(y), piece, name), 0.06, -1.0, 0.1))
@@ -221,9 +217,9 @@ def reach_out(end: Posture, stand: Posture, share: np.ndarray) -> Posture:
     for hand in np.flatnonzero(end.resting[0]):
         wrists[0, hand] = np.array([0.05 if hand == 0 else -0.05, -0.2, 0.13])
     palms = np.where(end.resting[..., None] > 0, end.palms, half.palms)
-    raised = dataclasses.replace(half, wrists=wrists, palms=palms, resting=np.zeros((1, 2)))
-    start = dataclasses.replace(stand, palms=palms)
-    goal = dataclasses.replace(end, wrists=wrists)
+    raised = replace(half, wrists=wrists, palms=palms, resting=np.zeros((1, 2)))
+    start = replace(stand, palms=palms)
+    goal = replace(end, wrists=wrists)
     first, second = share[share < 0.5], share[share >= 0.5]
     parts = ((start, raised, 2 * first), (raised, goal, 2 * second - 1))
     return chain([blend(a, b, smooth(part)) for a, b, part in parts if len(part)])
@@ -241,14 +237,10 @@ UP = np.array([0.0, 1.0, 0.0])
 class Berth:
     """Where one lies on a piece, and the edge from which one gets there."""
 
-    spot: Spot
-    """The edge: straight beside the pelvis."""
-    behind: float
-    """How far the lying pelvis is behind the edge [m]."""
-    head: float
-    """Heading of the direction from the pelvis to the head [rad]."""
-    knees_up: bool
-    """There is no room to stretch."""
+    spot: Spot  #: the edge: straight beside the pelvis
+    behind: float  #: how far the lying pelvis is behind the edge [m]
+    head: float  #: heading of the direction from the pelvis to the head [rad]
+    knees_up: bool  #: there is no room to stretch
 
 
 def berth(person: Person, pieces: tuple[Placed, ...], index: int, side: int) -> Berth:
@@ -320,7 +312,7 @@ def _heels_down(person: Person, lying: Posture, place: Berth) -> Posture:
         side = sole & (person.skin[:, 0] * joint[0] > 0)
         low = apply(lying.feet[0, k], person.skin[side] - joint)[:, 1].min()
         ankles[:, k, 1] = place.spot.height - low
-    return dataclasses.replace(lying, ankles=ankles)
+    return replace(lying, ankles=ankles)
 
 
 def _hands_on_hips(person: Person, lying: Posture) -> Posture:
@@ -329,17 +321,16 @@ def _hands_on_hips(person: Person, lying: Posture) -> Posture:
     for k, out in enumerate((1.0, -1.0)):
         place = lying.pelvis + apply(lying.turn, np.array([[out * 0.17, 0.0, 0.12]]))
         wrists.append(apply(np.swapaxes(chest, 1, 2), place - shoulders[:, k]))
-    return dataclasses.replace(lying, wrists=np.stack(wrists, 1))
+    return replace(lying, wrists=np.stack(wrists, 1))
 
 
 def _head_down(person: Person, lying: Posture, piece: Placed) -> Posture:
     """Nod less and less until the head rests on the pillow, or the neck is straight."""
 
     def nodding(nod: float) -> Posture:
-        return dataclasses.replace(lying, head=np.array([[nod, 0.0]]))
+        return replace(lying, head=np.array([[nod, 0.0]]))
 
-    nod = approach(lambda a: gap(person, nodding(a), piece, "head"), 0.8, -0.3, 0.95)
-    return nodding(nod)
+    return nodding(approach(lambda a: gap(person, nodding(a), piece, "head"), 0.8, -0.3, 0.95))
 
 
 def on_side(person: Person, back: Posture, place: Berth, piece: Placed) -> Posture:
@@ -358,7 +349,7 @@ def on_side(person: Person, back: Posture, place: Berth, piece: Placed) -> Postu
         middle = back.pelvis - (reach + 0.08) * along + 0.12 * towards
         ankles.append(middle + (0.11 if upper else 0.0) * UP)
         feet.append(low @ about(X, np.array([0.5])))
-    side = dataclasses.replace(
+    side = replace(
         back, turn=turn, ankles=np.stack(ankles, 1), feet=np.stack(feet, 1),
         knees=np.repeat((towards + 0.15 * UP)[None, None], 2, axis=1),
     )  # fmt: skip
@@ -367,7 +358,7 @@ def on_side(person: Person, back: Posture, place: Berth, piece: Placed) -> Postu
     high = np.zeros((1, 2, 3))
     high[0, 1 - lower, 1] = 0.12
     side = _heels_down(person, side, place)
-    side = dataclasses.replace(side, ankles=side.ankles + high)
+    side = replace(side, ankles=side.ankles + high)
     return _head_down(person, _hands_before(person, side, place, lower), piece)
 
 
@@ -380,10 +371,9 @@ def _hands_before(person: Person, lying: Posture, place: Berth, lower: int) -> P
         flat = min(ahead, place.behind - 0.02) * edge + along * head
         palms[:, k] = lying.pelvis + np.array([flat[0], 0, flat[1]])
         palms[:, k, 1] = place.spot.height + palm_height(person)
-    chest, _ = chest_of(person, lying)
-    up = apply(np.swapaxes(chest, 1, 2), UP[None])
+    up = apply(np.swapaxes(chest_of(person, lying)[0], 1, 2), UP[None])
     elbows = np.stack([up, up], 1)
-    return dataclasses.replace(lying, palms=palms, resting=np.ones((1, 2)), elbows=elbows)
+    return replace(lying, palms=palms, resting=np.ones((1, 2)), elbows=elbows)
 
 
 def lie_down(
@@ -397,7 +387,7 @@ def lie_down(
     flat = sitting.ankles + across * (lying.ankles - sitting.ankles)
     bump = 0.12 * np.sin(np.pi * np.clip(share, 0, 1)) ** 2
     ankles = np.stack([flat[..., 0], high[..., 1] + bump[:, None], flat[..., 2]], -1)
-    posture = dataclasses.replace(posture, ankles=ankles)
+    posture = replace(posture, ankles=ankles)
     rise = np.maximum(rest_on(person, posture, piece, "all"), 0.0)
     return moved(posture, rise[:, None] * UP)
 
@@ -407,8 +397,8 @@ def roll_over(
 ) -> Posture:
     """From one way of lying to another, always resting on the piece."""
     hands = end.resting[..., None] > 0
-    start = dataclasses.replace(start, palms=np.where(hands, end.palms, start.palms))
+    start = replace(start, palms=np.where(hands, end.palms, start.palms))
     posture = blend(start, end, smooth(share))
     rise = 0.06 * np.sin(np.pi * np.clip(share, 0, 1))[:, None, None] * UP
-    posture = dataclasses.replace(posture, palms=posture.palms + rise)
+    posture = replace(posture, palms=posture.palms + rise)
     return laid(person, posture, piece, "torso")

@@ -27,9 +27,8 @@ from mover.perceive.capture import Finders
 from mover.perceive.config import ModelsConfig, PerceiveConfig
 from mover.perceive.networks import PERSON, DetectInputs, Finds, JointsInputs, Tracks
 from mover.perceive.video import Clip
-from mover_bench.rooms.known import KnownRoom
+from mover_bench.rooms.known import KnownRoom, draw_frame
 from mover_bench.rooms.noise import slow
-from mover_bench.rooms.room import draw_frame
 
 COCO = {
     "bed": "bed", "sofa": "couch", "armchair": "chair", "chair": "chair", "office chair": "chair",
@@ -52,8 +51,7 @@ class Seen:
     """A known room with what is found in it."""
 
     room: KnownRoom
-    noisy: Capture
-    """Its masks are the networks' (`add_noise`)."""
+    noisy: Capture  #: its masks are the networks' (`add_noise`)
     seed: int
 
     def finders(self) -> Finders:

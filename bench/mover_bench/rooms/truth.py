@@ -114,8 +114,7 @@ class Nearness:
 
     distance: Float[np.ndarray, "frames verts"]
     """To the nearest piece or the floor, negative inside, at most `placed.FAR` [m]."""
-    nearest: Int[np.ndarray, "frames verts"]
-    """Index of that piece; -1 the ground."""
+    nearest: Int[np.ndarray, "frames verts"]  #: index of that piece; -1 the ground
 
 
 def nearness(skin: Float[np.ndarray, "frames verts 3"], pieces: tuple[Placed, ...]) -> Nearness:

@@ -174,9 +174,13 @@ def _run(job: BatchJob, out: Path, lock: int) -> Outcome:
         why = f"ended well without {' and '.join(missing)}"
     elif code < 0:
         why = f"ended by signal {-code} ({signal.strsignal(-code)})"
-    lines = (out / LOG).read_text(errors="replace").splitlines()
-    last = next((line.strip() for line in reversed(lines) if line.strip()), "it said nothing")
-    return ended(job, seconds, f"{why}: {last}")
+    return ended(job, seconds, f"{why}: {last_line(out / LOG)}")
+
+
+def last_line(log: Path) -> str:
+    """What a process said last."""
+    lines = log.read_text(errors="replace").splitlines() if log.is_file() else []
+    return next((line.strip() for line in reversed(lines) if line.strip()), "it said nothing")
 
 
 def ended(job: BatchJob, seconds: float, reason: str = "") -> Outcome:
