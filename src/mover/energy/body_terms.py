@@ -257,9 +257,7 @@ def under_term(skin: Float[Tensor, "bodies points 3"], floor: float) -> Float[Te
 
 
 def stand_term(
-    soles: Float[Tensor, "bodies feet 3"],
-    rest: Float[Tensor, "bodies feet"],
-    floor: float,
+    soles: Float[Tensor, "bodies feet 3"], rest: Float[Tensor, "bodies feet"], floor: float
 ) -> Float[Tensor, " bodies"]:
     """Cost of the lowest places of feet at rest (a chance) that are not on the floor [nats]."""
     off = geman_mcclure((soles[..., 1] - floor) / SOFT, STAND_TAIL)

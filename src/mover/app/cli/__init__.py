@@ -14,79 +14,39 @@ from typing import Any
 from mover.core.errors import InputError
 
 COMMANDS = {
-    "demo": (
-        "mover.app.cli.demo:demo",
-        "Reconstruct a known room that comes with the package, compare it with the truth.",
-    ),
-    "video": (
-        "mover.app.cli.video:video",
-        "From a video or a picture to a room: pictures, bodies, first scene, room, report.",
-    ),
-    "weights": (
-        "mover.app.cli.video:bring_weights",
-        "Bring small networks for `mover video` into the cache folder.",
-    ),
-    "import": (
-        "mover.app.cli.imports:import_",
-        "Turn what other tools wrote into a capture folder.",
-    ),
-    "layout": (
-        "mover.app.cli.video:layout",
-        "Find a first scene of library furniture in one picture's masks or boxes.",
-    ),
-    "import-bodies": (
-        "mover.app.cli.people:bodies",
-        "Turn what another tool found of people into bodies.npz or keypoints.npz.",
-    ),
-    "fit": (
-        "mover.app.cli.people:fit",
-        "Fit bodies to the 2D joints of a video.",
-    ),
-    "check": (
-        "mover.app.cli.results:check",
-        "Validate a capture, list the evidence of each object, draw the initial overlay.",
-    ),
-    "run": (
-        "mover.app.cli.run:run",
-        "Reconstruct a room from a capture folder.",
-    ),
-    "refine": (
-        "mover.app.cli.refine:refine",
-        "Refine the people of a result with its room: their pose, or their place.",
-    ),
-    "contacts": (
-        "mover.app.cli.refine:contacts",
-        "Which vertices touch something, by POSA's network or from files.",
-    ),
-    "evaluate": (
-        "mover.app.cli.results:evaluate",
-        "Compare a result with the truth.",
-    ),
-    "paper-table": (
-        "mover_bench.cli:show_paper_table",
-        "Print the paper's table for your copy of PROX or PiGraphs.",
-    ),
-    "experiment": (
-        "mover_bench.cli:experiment",
-        "Reconstruct known rooms with variants of the method and compare them with the truth.",
-    ),
-    "export": (
-        "mover.app.cli.results:export",
-        "Write a result for other programs: GLB, USD, MJCF, PLY, AMASS, contacts.",
-    ),
-    "render": (
-        "mover.app.cli.results:render",
-        "Draw a result without a screen: a picture or a film.",
-    ),
-    "view": (
-        "mover.app.cli.results:view",
-        "Look at a result in the browser, and correct it.",
-    ),
-    "batch": (
-        "mover.app.cli.run:batch",
-        "Run thousands of captures; what is finished is not run again.",
-    ),
-}
+    "demo": ("mover.app.cli.demo:demo",
+        "Reconstruct a known room that comes with the package, compare it with the truth."),
+    "video": ("mover.app.cli.video:video",
+        "From a video or a picture to a room: pictures, bodies, first scene, room, report."),
+    "weights": ("mover.app.cli.video:bring_weights",
+        "Bring small networks for `mover video` into the cache folder."),
+    "import": ("mover.app.cli.imports:import_",
+        "Turn what other tools wrote into a capture folder."),
+    "layout": ("mover.app.cli.video:layout",
+        "Find a first scene of library furniture in one picture's masks or boxes."),
+    "import-bodies": ("mover.app.cli.people:bodies",
+        "Turn what another tool found of people into bodies.npz or keypoints.npz."),
+    "fit": ("mover.app.cli.people:fit", "Fit bodies to the 2D joints of a video."),
+    "check": ("mover.app.cli.results:check",
+        "Validate a capture, list the evidence of each object, draw the initial overlay."),
+    "run": ("mover.app.cli.run:run", "Reconstruct a room from a capture folder."),
+    "refine": ("mover.app.cli.refine:refine",
+        "Refine the people of a result with its room: their pose, or their place."),
+    "contacts": ("mover.app.cli.refine:contacts",
+        "Which vertices touch something, by POSA's network or from files."),
+    "evaluate": ("mover.app.cli.results:evaluate", "Compare a result with the truth."),
+    "paper-table": ("mover_bench.cli:show_paper_table",
+        "Print the paper's table for your copy of PROX or PiGraphs."),
+    "experiment": ("mover_bench.cli:experiment",
+        "Reconstruct known rooms with variants of the method and compare them with the truth."),
+    "export": ("mover.app.cli.results:export",
+        "Write a result for other programs: GLB, USD, MJCF, PLY, AMASS, contacts."),
+    "render": ("mover.app.cli.results:render",
+        "Draw a result without a screen: a picture or a film."),
+    "view": ("mover.app.cli.results:view", "Look at a result in the browser, and correct it."),
+    "batch": ("mover.app.cli.run:batch",
+        "Run thousands of captures; what is finished is not run again."),
+}  # fmt: skip
 """Where a command is, and what it does."""
 OWN_INTERRUPT = ("batch", "experiment", "paper-table")
 """Commands that end their own processes on Ctrl-C."""

@@ -69,11 +69,7 @@ def run(arguments: Sequence[str]) -> None:
 
 
 def reconstruct_into(
-    out: Path,
-    capture: "Capture",
-    config: Config,
-    origin: "Origin",
-    report: bool = True,
+    out: Path, capture: "Capture", config: Config, origin: "Origin", report: bool = True
 ) -> "tuple[Room, Run]":
     """Run the main job on the edited capture and write its result."""
     import torch

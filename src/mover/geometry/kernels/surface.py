@@ -77,12 +77,7 @@ def pull_pixel(scene: Items, maps: MapArrays, pull: Pull, pixel: int) -> None:
 
 @wp.func
 def pull_depth(
-    scene: Items,
-    pixel: int,
-    face: int,
-    z: float,
-    gradient: float,
-    grads: wp.array(dtype=wp.vec3),
+    scene: Items, pixel: int, face: int, z: float, gradient: float, grads: wp.array(dtype=wp.vec3)
 ) -> None:
     """Add the gradient of a pixel's depth to the vertices of the face that it sees.
 

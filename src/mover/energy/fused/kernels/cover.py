@@ -78,9 +78,7 @@ def face_all(data: KernelInput, work: Workspace, p: Pose) -> int:
     for f in range(data.things.starts[p.thing + 1, FACES] - first):
         face = data.things.faces[first + f]
         area = signed_area(
-            work.scratch.screen[face[0]],
-            work.scratch.screen[face[1]],
-            work.scratch.screen[face[2]],
+            work.scratch.screen[face[0]], work.scratch.screen[face[1]], work.scratch.screen[face[2]]
         )
         work.scratch.front[f] = wp.where(area < 0.0, FRONT, wp.where(area > 0.0, BACK, NEITHER))
         neither += wp.where(area == 0.0, 1, 0)
