@@ -53,16 +53,11 @@ class BatchJob:
 
     name: str
     capture: str
-    out: str
-    """Folder of its result."""
-    command: tuple[str, ...]
-    """What to run; it exits with 0 when it is well."""
-    fingerprint: str
-    """Of the configuration and the capture's files."""
-    limit: float = 0.0
-    """Most seconds; 0: no limit."""
-    threads: int = 1
-    """Threads of the numerical libraries."""
+    out: str  #: folder of its result
+    command: tuple[str, ...]  #: what to run; it exits with 0 when it is well
+    fingerprint: str  #: of the configuration and the capture's files
+    limit: float = 0.0  #: most seconds; 0: no limit
+    threads: int = 1  #: threads of the numerical libraries
 
 
 @dataclass(frozen=True)
@@ -72,10 +67,8 @@ class Outcome:
     name: str
     state: Literal["done", "kept", "failed", "stopped"]
     """stopped: interrupted, so that nothing is recorded."""
-    seconds: float = 0.0
-    """Wall clock of the run that made the result."""
-    reason: str = ""
-    """Why it failed, in one line; empty if it did not."""
+    seconds: float = 0.0  #: wall clock of the run that made the result
+    reason: str = ""  #: why it failed, in one line; empty if it did not
 
 
 def captures_in(listing: Path, out: Path | None = None) -> tuple[Path, ...]:

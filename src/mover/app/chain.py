@@ -31,8 +31,7 @@ class Steps:
 
     folder: Path
     say: Say
-    names: tuple[str, ...]
-    """All steps in their order."""
+    names: tuple[str, ...]  #: all steps in their order
     log: dict[str, dict[str, Any]] = field(default_factory=lambda: {})
     """What each took, and the hash of what it was made from."""
 
@@ -111,10 +110,8 @@ def digest(made_from: Iterable[Path | str]) -> str:
 class BodiesFrom:
     """Where bodies come from."""
 
-    source: str = FIT
-    """`fit`, a file or folder, or a command with {out} in it."""
-    tool: str = ""
-    """What wrote the file, a name of `mover import-bodies`; empty: bodies.npz."""
+    source: str = FIT  #: `fit`, a file or folder, or a command with {out} in it
+    tool: str = ""  #: what wrote the file, a name of `mover import-bodies`; empty: bodies.npz
 
     @property
     def is_command(self) -> bool:

@@ -38,15 +38,11 @@ POINTS = 500  # of a trace, about, that run.json keeps
 class Origin:
     """Where a result comes from, so that it can be computed again."""
 
-    source: str = ""
-    """Full path of the capture."""
+    source: str = ""  #: full path of the capture
     format: str = "folder"
-    edits: tuple[Edit, ...] = ()
-    """What the user changed in it before."""
-    refine: bool = False
-    """Whether the people were refined with the room at the end."""
-    device: torch.device = CPU
-    """Where the heavy stages computed."""
+    edits: tuple[Edit, ...] = ()  #: what the user changed in it before
+    refine: bool = False  #: whether the people were refined with the room at the end
+    device: torch.device = CPU  #: where the heavy stages computed
 
 
 def write_results(

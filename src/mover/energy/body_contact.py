@@ -55,12 +55,9 @@ EDGE = 0.03  # [m], by which a plane and the furniture's own distance may differ
 class Surface:
     """Points of the furniture."""
 
-    points: Float[Tensor, "points 3"]
-    """[m]."""
-    normals: Float[Tensor, "points 3"]
-    """Outward unit normals."""
-    piece: Int[Tensor, " points"]
-    """Of the furniture, from 0."""
+    points: Float[Tensor, "points 3"]  #: [m]
+    normals: Float[Tensor, "points 3"]  #: outward unit normals
+    piece: Int[Tensor, " points"]  #: of the furniture, from 0
     uncertainty: Float[Tensor, " pieces"]
     """Usual error of the position of each object's surface, beside `KEPT` [m]."""
 
@@ -69,22 +66,18 @@ class Surface:
 class Skin:
     """Skin points and the chance that they touch."""
 
-    points: Float[Tensor, "bodies points 3"]
-    """[m]."""
-    normals: Float[Tensor, "bodies points 3"]
-    """Outward unit normals."""
+    points: Float[Tensor, "bodies points 3"]  #: [m]
+    normals: Float[Tensor, "bodies points 3"]  #: outward unit normals
     chance: Float[Tensor, "bodies points"]
     group: Int[Tensor, " points"]
     """From 0: parts of the body; points of one part share a weight and have one foremost point, so
     that a thigh that hangs does not count for the seat."""
-    track: Int[Tensor, " bodies"]
-    """Number of each body's person, from 0."""
+    track: Int[Tensor, " bodies"]  #: number of each body's person, from 0
     pivot: Float[Tensor, "bodies 3"]
     """About which a body is turned by the errors of its pose: its pelvis [m]."""
     flat: Bool[Tensor, " bodies"]
     """Lying bodies: all parts have one foremost point, since backs arch over the mattress."""
-    bent: float
-    """Usual angle by which the pose is wrong [rad]; 0: it may be corrected."""
+    bent: float  #: usual angle by which the pose is wrong [rad]; 0: it may be corrected
 
 
 @record
@@ -92,19 +85,14 @@ class Matches:
     """Which skin touches which plane."""
 
     body: Int[Tensor, " matches"]
-    point: Int[Tensor, " matches"]
-    """Index of the skin point."""
-    place: Float[Tensor, "matches 3"]
-    """A point of the plane [m]."""
+    point: Int[Tensor, " matches"]  #: index of the skin point
+    place: Float[Tensor, "matches 3"]  #: a point of the plane [m]
     normal: Float[Tensor, "matches 3"]
-    weight: Float[Tensor, " matches"]
-    """Share in its group's weight; at most `POINTS` in sum."""
-    usual: Float[Tensor, " matches"]
-    """Usual distance of skin that touches [m]."""
+    weight: Float[Tensor, " matches"]  #: share in its group's weight; at most `POINTS` in sum
+    usual: Float[Tensor, " matches"]  #: usual distance of skin that touches [m]
     kept: Int[Tensor, " matches"]
     """Which share an error that lasts: one part of one person on one object; from 0."""
-    lasting: Float[Tensor, " kept"]
-    """Usual size of each of these errors [m]."""
+    lasting: Float[Tensor, " kept"]  #: usual size of each of these errors [m]
 
 
 def gather_matches(skin: Skin, surface: Surface, furniture: Volume | None = None) -> Matches:

@@ -136,16 +136,11 @@ SIGMA_HELD = 0.25  # of limbs about the pelvis, in sizes of the body
 class Neighbours:
     """Which rows follow each other in time."""
 
-    triples: Int[Tensor, "triples 3"]
-    """Rows before, at and after a moment."""
-    steps: Float[Tensor, "triples 2"]
-    """Time from the first to the second and to the third [s]."""
-    pairs: Int[Tensor, "pairs 2"]
-    """Rows that follow each other."""
-    gaps: Float[Tensor, " pairs"]
-    """Time between them [s]."""
-    track: Int[Tensor, " rows"]
-    """Number of each row's person, from 0."""
+    triples: Int[Tensor, "triples 3"]  #: rows before, at and after a moment
+    steps: Float[Tensor, "triples 2"]  #: time from the first to the second and to the third [s]
+    pairs: Int[Tensor, "pairs 2"]  #: rows that follow each other
+    gaps: Float[Tensor, " pairs"]  #: time between them [s]
+    track: Int[Tensor, " rows"]  #: number of each row's person, from 0
 
 
 def gather_neighbours(
@@ -295,24 +290,19 @@ ORDER_POINTS = 20.0  # independent places of a body's skin
 class Bounds:
     """How near and far skin points may be."""
 
-    near: Float[Tensor, "bodies points"]
-    """Depth that hidden skin has at least [m]; -inf: no bound."""
-    far: Float[Tensor, "bodies points"]
-    """Depth that visible skin has at most [m]; inf: no bound."""
+    near: Float[Tensor, "bodies points"]  #: depth that hidden skin has at least [m]; -inf: no bound
+    far: Float[Tensor, "bodies points"]  #: depth that visible skin has at most [m]; inf: no bound
 
 
 @record
 class Sighting:
     """What is seen where skin points are projected."""
 
-    front: Float[Tensor, "bodies points"]
-    """Depth of the nearest furniture there [m]; inf: none."""
-    shown: Bool[Tensor, "bodies points"]
-    """Well inside the person's visible mask."""
+    front: Float[Tensor, "bodies points"]  #: depth of the nearest furniture there [m]; inf: none
+    shown: Bool[Tensor, "bodies points"]  #: well inside the person's visible mask
     hidden: Bool[Tensor, "bodies points"]
     """Well outside the masks of people, inside the mask of the furniture that is drawn there."""
-    facing: Bool[Tensor, "bodies points"]
-    """The skin faces the camera."""
+    facing: Bool[Tensor, "bodies points"]  #: the skin faces the camera
     loose: Float[Tensor, "bodies points"]
     """Uncertainty of the depth of that furniture along the ray, from that of its shape [m]."""
 
@@ -355,16 +345,11 @@ class Outline:
     """Where the outlines of bodies should go, seen from where they are."""
 
     body: Int[Tensor, " points"]
-    skin: Int[Tensor, " points"]
-    """Index of the skin point that carries the outline."""
-    pixel: Float[Tensor, "points 2"]
-    """Where that skin point is seen now [px]."""
-    normal: Float[Tensor, "points 2"]
-    """Of the outline in the image, outwards."""
-    gap: Float[Tensor, " points"]
-    """How far the outline is outside its mask [px]; negative: inside."""
-    weight: Float[Tensor, " points"]
-    """Share in the body's weight, at most `OUTLINE_POINTS` in sum."""
+    skin: Int[Tensor, " points"]  #: index of the skin point that carries the outline
+    pixel: Float[Tensor, "points 2"]  #: where that skin point is seen now [px]
+    normal: Float[Tensor, "points 2"]  #: of the outline in the image, outwards
+    gap: Float[Tensor, " points"]  #: how far the outline is outside its mask [px]; negative: inside
+    weight: Float[Tensor, " points"]  #: share in the body's weight, at most `OUTLINE_POINTS` in sum
 
 
 def outline_term(

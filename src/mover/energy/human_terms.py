@@ -40,10 +40,8 @@ FEWEST = 100.0  # pixels by which the robust form divides at least
 class DepthMaps:
     """Bounds from all frames in the image, and who set them."""
 
-    near: Float[Tensor, "h w"]
-    """Lower bound [m]; -inf where no person stood in front of an object."""
-    far: Float[Tensor, "h w"]
-    """Upper bound [m]; inf where no object hid a person."""
+    near: Float[Tensor, "h w"]  #: lower bound [m]; -inf where no person stood in front of an object
+    far: Float[Tensor, "h w"]  #: upper bound [m]; inf where no object hid a person
 
 
 @record
@@ -60,16 +58,12 @@ class DepthRange:
 class BodyView:
     """One person in one frame: what was seen of the body, and what was hidden."""
 
-    front: Float[Tensor, "h w"]
-    """Depth where the ray enters the body [m]; inf where it misses."""
+    front: Float[Tensor, "h w"]  #: depth where the ray enters the body [m]; inf where it misses
     exit: Float[Tensor, "h w"]
     """Depth where it first leaves the body, or of the body's far side [m]."""
-    visible: Bool[Tensor, "h w"]
-    """The person's visible mask."""
-    others: Bool[Tensor, "h w"]
-    """Masks of the other people of the frame."""
-    reach: float = 0.0
-    """How far the drawn outline may be wrong [px]."""
+    visible: Bool[Tensor, "h w"]  #: the person's visible mask
+    others: Bool[Tensor, "h w"]  #: masks of the other people of the frame
+    reach: float = 0.0  #: how far the drawn outline may be wrong [px]
 
 
 def bounds_of(
@@ -165,8 +159,7 @@ SAMPLES = 1000.0  # of an object in the authors' code; 3 cm inside on each costs
 class BodySpace:
     """The space that the people have moved through."""
 
-    volume: Volume
-    """Signed distance to the nearest body of any frame."""
+    volume: Volume  #: signed distance to the nearest body of any frame
 
 
 def collision_term(
@@ -219,14 +212,11 @@ CONTACT_SHARE = (1.0, 0.25, 1.0, 0.25)  # of seat or top, back, then the same fo
 class ContactPoints:
     """Body points that touch furniture, from all frames, packed over the touched objects."""
 
-    object_of: Int[Tensor, " touched"]
-    """Index of each touched object."""
+    object_of: Int[Tensor, " touched"]  #: index of each touched object
     points: Float[Tensor, "touched 4 points 3"]
     """Positions in the world [m] by part: top, back, top by hand, back by hand."""
-    weight: Float[Tensor, "touched 4 points"]
-    """Body vertices that a point stands for; 0 pads."""
-    bodies: Float[Tensor, " touched"]
-    """Number of bodies that touch the object."""
+    weight: Float[Tensor, "touched 4 points"]  #: body vertices that a point stands for; 0 pads
+    bodies: Float[Tensor, " touched"]  #: number of bodies that touch the object
     share: Float[Tensor, "touched 4"]
     """Of all body vertices that touch seats and tops, or backs, those that touch this part [1]."""
     heading: Float[Tensor, "touched 2"]
@@ -333,14 +323,10 @@ TILT_TAIL = 2.0  # degrees of freedom of the prior of the tilt, which forgives l
 class FootContacts:
     """Points under the feet that carry the people, from all frames."""
 
-    points_cam: Float[Tensor, "soles 3"]
-    """Positions in camera axes [m]."""
-    person: Int[Tensor, " soles"]
-    """Track of each point."""
-    frame: Int[Tensor, " soles"]
-    """Frame of each point."""
-    warnings: tuple[str, ...]
-    """What made the evidence weaker than it should be."""
+    points_cam: Float[Tensor, "soles 3"]  #: positions in camera axes [m]
+    person: Int[Tensor, " soles"]  #: track of each point
+    frame: Int[Tensor, " soles"]  #: frame of each point
+    warnings: tuple[str, ...]  #: what made the evidence weaker than it should be
 
 
 def up_cam(

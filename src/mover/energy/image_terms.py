@@ -125,8 +125,7 @@ class BestShift(NamedTuple):
 
     bbox: Float[Tensor, "*starts objects"]
     silhouette: Float[Tensor, "*starts objects"]
-    shift: Int[Tensor, "*starts objects"]
-    """Its number."""
+    shift: Int[Tensor, "*starts objects"]  #: its number
 
 
 def borders_of(
@@ -188,10 +187,8 @@ NEAREST = 0.05  # [m], nothing is nearer
 class Measured:
     """The measured depth in the windows of the objects, after its scale was fitted to the room."""
 
-    depth: Float[Tensor, "objects h w"]
-    """[m]; 0 where it is not known."""
-    spread: Float[Tensor, " objects"]
-    """How far it is off: standard deviation of its logarithm."""
+    depth: Float[Tensor, "objects h w"]  #: [m]; 0 where it is not known
+    spread: Float[Tensor, " objects"]  #: how far it is off: standard deviation of its logarithm
 
 
 def measured_term(

@@ -94,16 +94,12 @@ COMMON = 0.06  # error that the three given sizes of an object have in common, a
 class Given:
     """What the initial scene, the room and standard dimensions say of each object."""
 
-    distance: Float[Tensor, " objects"]
-    """From the camera to the middle of the base, as given [m]."""
-    yaw: Float[Tensor, " objects"]
-    """[rad]"""
-    along: Float[Tensor, " objects"]
-    """Chance that it stands along an axis of the room."""
+    distance: Float[Tensor, " objects"]  #: from the camera to the middle of the base, as given [m]
+    yaw: Float[Tensor, " objects"]  #: [rad]
+    along: Float[Tensor, " objects"]  #: chance that it stands along an axis of the room
     sharpness: Float[Tensor, " objects"]
     """How well those that do stand along it, and how well it is known: of a von Mises density."""
-    axis: Float[Tensor, " objects"]
-    """Direction of an axis of the room, up to quarter turns [rad]."""
+    axis: Float[Tensor, " objects"]  #: direction of an axis of the room, up to quarter turns [rad]
     standard: Float[Tensor, "objects 3"]
     """Standard sizes, as logarithms of factors on those of the mesh."""
     precision: Float[Tensor, "objects 3"]
@@ -202,10 +198,8 @@ ALONG = 0.7  # cosine between the outward directions of a rear and a line, below
 class Walls:
     """Lines over the floor along which furniture stands."""
 
-    out: Float[Tensor, "walls 2"]
-    """Unit normal (x, z), out of the room."""
-    offset: Float[Tensor, " walls"]
-    """Of its points along the normal [m]."""
+    out: Float[Tensor, "walls 2"]  #: unit normal (x, z), out of the room
+    offset: Float[Tensor, " walls"]  #: of its points along the normal [m]
     trust: Float[Tensor, "objects walls"]
     """How well others constrain the line, in [0, 1]; 0: it says nothing about the object."""
 
@@ -214,10 +208,8 @@ class Walls:
 class Rears:
     """The sides of objects that look away from the camera."""
 
-    out: Float[Tensor, "*starts objects 2"]
-    """Unit normal (x, z), away from the camera."""
-    ends: Float[Tensor, "*starts objects 2 2"]
-    """The two corners over the floor (x, z) [m]."""
+    out: Float[Tensor, "*starts objects 2"]  #: unit normal (x, z), away from the camera
+    ends: Float[Tensor, "*starts objects 2 2"]  #: the two corners over the floor (x, z) [m]
 
 
 def rears_of(layout: Layout, size: Float[Tensor, "objects 3"]) -> Rears:
@@ -271,12 +263,9 @@ FAR = 0.05  # [m]
 class Solids:
     """What objects fill, and where they can stand in each other."""
 
-    sections: Mapping[int, Sections]
-    """Of each object of a pair, in its own frame."""
-    upright: Bool[Tensor, "objects samples"]
-    """Samples above and below which their object goes on."""
-    pairs: Int[Tensor, "pairs 2"]
-    """Whose samples may lie in whom; on the CPU."""
+    sections: Mapping[int, Sections]  #: of each object of a pair, in its own frame
+    upright: Bool[Tensor, "objects samples"]  #: samples above and below which their object goes on
+    pairs: Int[Tensor, "pairs 2"]  #: whose samples may lie in whom; on the CPU
 
 
 def gather_solids(

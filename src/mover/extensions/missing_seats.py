@@ -181,10 +181,8 @@ class Rest:
 
     row: int
     lies: bool
-    points: Float[Tensor, "verts 3"]
-    """What touches [m]."""
-    covered: bool
-    """Something known carries it."""
+    points: Float[Tensor, "verts 3"]  #: what touches [m]
+    covered: bool  #: something known carries it
 
 
 def resting_bodies(people: Resting, known: KnownTops) -> list[Rest]:

@@ -87,10 +87,8 @@ class ScaleInputs:
 class PathScale:
     """How long the unit of the path is."""
 
-    scale: float
-    """[m]"""
-    spread: float
-    """Standard deviation, as a share of the scale."""
+    scale: float  #: [m]
+    spread: float  #: standard deviation, as a share of the scale
     warnings: tuple[str, ...]
 
 
@@ -102,8 +100,7 @@ class _Pairs:
     """From the first to the second, were the camera turning on the spot; see `_weighted`."""
     camera: Float[Tensor, "pairs 3"]
     """What the camera moved meanwhile, per unit of the path; see `_weighted`."""
-    block: Int[Tensor, " pairs"]
-    """Part of the video."""
+    block: Int[Tensor, " pairs"]  #: part of the video
 
 
 def find_scale(inputs: ScaleInputs, config: None = None, observe: Observer = silent) -> PathScale:

@@ -14,12 +14,9 @@ from mover.geometry.rotations import rot_y
 class Box:
     """Upright boxes: turned about the vertical only."""
 
-    center: Float[Tensor, "*b 3"]
-    """Middle of the box in the world [m]."""
-    size: Float[Tensor, "*b 3"]
-    """Full edges along the box's own axes [m]."""
-    yaw: Float[Tensor, "*b"]
-    """Right-handed rotation about +y [rad]."""
+    center: Float[Tensor, "*b 3"]  #: middle of the box in the world [m]
+    size: Float[Tensor, "*b 3"]  #: full edges along the box's own axes [m]
+    yaw: Float[Tensor, "*b"]  #: right-handed rotation about +y [rad]
 
 
 def box_of(piece: SceneObject) -> Box:

@@ -111,8 +111,7 @@ class StandingMesh:
 
     mesh: Mesh
     first: int = -ENDLESS
-    end: int = ENDLESS
-    """The first frame in which it is elsewhere."""
+    end: int = ENDLESS  #: the first frame in which it is elsewhere
 
     def when(self, frame: Int[Tensor, " rows"]) -> Bool[Tensor, " rows"]:
         """Whether it stands there in each of some frames."""

@@ -28,8 +28,7 @@ class Sections:
     outline: Volume
     """Signed distance to the outline of the section at each height [m], negative inside; heights
     are stretched, so that cells are cubes."""
-    stretch: float
-    """By what."""
+    stretch: float  #: by what
 
 
 def sections_of(verts: Float[Tensor, "verts 3"], faces: Int[Tensor, "faces 3"]) -> Sections:

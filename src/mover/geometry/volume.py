@@ -29,10 +29,8 @@ class Volume:
 
     values: Float[Tensor, "x y z"]
     """Signed distance [m], negative inside; a positive constant away from the bodies."""
-    origin: Float[Tensor, "3"]
-    """Centre of cell (0, 0, 0) in the world [m]."""
-    cell: float
-    """Edge of a cell [m]."""
+    origin: Float[Tensor, "3"]  #: centre of cell (0, 0, 0) in the world [m]
+    cell: float  #: edge of a cell [m]
 
     @cached_property
     def busy(self) -> UInt8[Tensor, "bx by bz"]:

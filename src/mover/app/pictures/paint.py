@@ -33,25 +33,20 @@ EDGE = 1.2  # [m], how far the floor reaches beyond what stands on it
 class Surfaces:
     """Triangles in the world, each with a colour and the index of its owner."""
 
-    verts: Float[Tensor, "verts 3"]
-    """[m]"""
+    verts: Float[Tensor, "verts 3"]  #: [m]
     faces: Int[Tensor, "faces 3"]
     normals: Float[Tensor, "faces 3"]
     """Unit vectors; of smooth skin the mean of the normals at the corners."""
-    tint: Float[Tensor, "faces 3"]
-    """In [0, 1]."""
-    owner: Int[Tensor, " faces"]
-    """Index of the object, or `PERSON` and the number of the track."""
+    tint: Float[Tensor, "faces 3"]  #: in [0, 1]
+    owner: Int[Tensor, " faces"]  #: index of the object, or `PERSON` and the number of the track
 
 
 @record
 class Drawn:
     """What each pixel of an eye shows."""
 
-    owner: Int[Tensor, "h w"]
-    """As in `Surfaces`; `NO_OWNER` for nothing."""
-    normal: Float[Tensor, "h w 3"]
-    """Of the surface in the world, towards the eye."""
+    owner: Int[Tensor, "h w"]  #: as in `Surfaces`; `NO_OWNER` for nothing
+    normal: Float[Tensor, "h w 3"]  #: of the surface in the world, towards the eye
     tint: Float[Tensor, "h w 3"]
 
 

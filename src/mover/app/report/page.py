@@ -41,25 +41,20 @@ class ReportContent:
     """Everything that a report can show; what is missing is left out of the page."""
 
     title: str
-    image: Float[Tensor, "h w 3"] | None
-    """The reference image, in [0, 1]."""
+    image: Float[Tensor, "h w 3"] | None  #: the reference image, in [0, 1]
     initial: Scene
     result: Scene
     truth: Scene | None = None
-    initial_bodies: Bodies | None = None
-    """People in the world of `initial`."""
-    bodies: Bodies | None = None
-    """People in the world of `result`."""
-    metrics: Mapping[str, Any] | None = None
-    """What metrics.json holds."""
+    initial_bodies: Bodies | None = None  #: people in the world of `initial`
+    bodies: Bodies | None = None  #: people in the world of `result`
+    metrics: Mapping[str, Any] | None = None  #: what metrics.json holds
     warnings: tuple[str, ...] = ()
     stages: Sequence[Mapping[str, Any]] = ()
     """`name`, `seconds`, `memory` or `peak_memory` [MB] and `kept` of each stage."""
     config: Mapping[str, Any] = field(default_factory=lambda: {})
     objects: Sequence[Mapping[str, Any]] = ()
     """Rows of the table of objects, found by `id`; other keys become columns."""
-    command: str = ""
-    """What the user typed."""
+    command: str = ""  #: what the user typed
     version: str = __version__
     estimates: tuple[str, ...] = ()
     """Lens and scale with their spreads, and what would narrow them."""

@@ -26,10 +26,8 @@ EYE_HEIGHT = 1.5  # [m], of a camera above an unknown floor
 class Thinning:
     """A choice of vertices that stands for all, and triangles between them."""
 
-    kept: Int[Tensor, " kept"]
-    """Indices into the original vertices."""
-    faces: Int[Tensor, "faces 3"]
-    """Indices into `kept`."""
+    kept: Int[Tensor, " kept"]  #: indices into the original vertices
+    faces: Int[Tensor, "faces 3"]  #: indices into `kept`
 
 
 def thin(mesh: Mesh, count: int) -> Mesh:
@@ -66,10 +64,8 @@ def thin_choice(
 class ReportScene:
     """Data of the 3D view."""
 
-    text: str
-    """JSON: placements, cameras, and where each array lies in `block`."""
-    block: str
-    """Little-endian arrays, base64: 16-bit vertices in steps from a middle, and faces."""
+    text: str  #: JSON: placements, cameras, and where each array lies in `block`
+    block: str  #: little-endian arrays, base64: 16-bit vertices in steps from a middle, and faces
 
 
 def pack_view(scenes: dict[str, Scene], bodies: dict[str, Bodies]) -> ReportScene:

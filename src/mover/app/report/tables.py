@@ -75,12 +75,9 @@ JUDGED = {"iou3d": "3D IoU", "center_error": "Centre error"}  # beside each obje
 class Change:
     """What the run did to an object."""
 
-    moved: float
-    """Distance between the centres of its box, seen from the camera [m]."""
-    turned: float
-    """Turn about its own vertical [rad]."""
-    grown: tuple[float, ...]
-    """Factor of its size along each of its axes."""
+    moved: float  #: distance between the centres of its box, seen from the camera [m]
+    turned: float  #: turn about its own vertical [rad]
+    grown: tuple[float, ...]  #: factor of its size along each of its axes
 
 
 def find_changes(initial: Scene, result: Scene) -> dict[str, Change]:
@@ -107,10 +104,8 @@ class Cell:
     """One cell of a table."""
 
     text: str
-    kind: str = ""
-    """A class of report.css."""
-    tint: str = ""
-    """Colour of a dot before the text."""
+    kind: str = ""  #: a class of report.css
+    tint: str = ""  #: colour of a dot before the text
 
 
 def draw_table(titles: Sequence[Cell], rows: Sequence[Sequence[Cell]]) -> str:

@@ -89,12 +89,9 @@ class RoomWindow:
     ground: Any = None
     camera: Any = None
     camera_visible: bool = True
-    gizmo: Any = None
-    """What the mouse holds."""
-    moment: int = 0
-    """Position on the time line."""
-    world: World = "after"
-    """Whose furniture, people, floor and camera are shown."""
+    gizmo: Any = None  #: what the mouse holds
+    moment: int = 0  #: position on the time line
+    world: World = "after"  #: whose furniture, people, floor and camera are shown
 
     def set_world(self, world: World) -> None:
         """Show the room before or after the run."""

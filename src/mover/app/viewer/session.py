@@ -35,12 +35,9 @@ class Shown:
     title: str
     result: Scene
     initial: Scene
-    bodies: Bodies | None
-    """People in the world of `result`."""
-    initial_bodies: Bodies | None
-    """People in the world of `initial`."""
-    image: Float[Tensor, "h w 3"] | None = None
-    """The reference image, in [0, 1]."""
+    bodies: Bodies | None  #: people in the world of `result`
+    initial_bodies: Bodies | None  #: people in the world of `initial`
+    image: Float[Tensor, "h w 3"] | None = None  #: the reference image, in [0, 1]
     log: Mapping[str, Any] = field(default_factory=dict[str, Any])
     """What run.json holds; `edits`: how many of the list are part of the result already."""
 
@@ -73,11 +70,9 @@ class Session:
     """What the user sees and has changed; every change is saved at once."""
 
     shown: Shown
-    file: Path | None
-    """Where the edits are kept; None: nowhere."""
+    file: Path | None  #: where the edits are kept; None: nowhere
     edits: tuple[Edit, ...] = ()
-    done: int = 0
-    """Number of edits that are part of `shown.result`."""
+    done: int = 0  #: number of edits that are part of `shown.result`
     selected: str | None = None
     listeners: list[Callable[[], None]] = field(default_factory=list[Callable[[], None]])
 

@@ -37,29 +37,21 @@ class BufferSize:
     verts: int
     faces: int
     edges: int
-    height: int
-    """Rows of a grid, with the border [px]."""
-    width: int
-    """Columns of a grid, with the border [px]."""
-    shifts: int = 1
-    """How many borders each mask may have."""
+    height: int  #: rows of a grid, with the border [px]
+    width: int  #: columns of a grid, with the border [px]
+    shifts: int = 1  #: how many borders each mask may have
 
 
 @dataclass
 class FusedEnergy:
     """The kernel and its memory, for layouts of one evidence; it is used by one at a time."""
 
-    data: Any
-    """`kernels.data.KernelInput`."""
+    data: Any  #: `kernels.data.KernelInput`
     size: BufferSize
-    effort: Tensor
-    """How much work each object is, roughly."""
-    camera: Tensor
-    """From the world to the camera, where nothing else is asked for."""
-    turn: Tensor
-    """The same as it is now; memory of the kernel."""
-    buffers: "_Buffers | None" = None
-    """Memory for the most items so far."""
+    effort: Tensor  #: how much work each object is, roughly
+    camera: Tensor  #: from the world to the camera, where nothing else is asked for
+    turn: Tensor  #: the same as it is now; memory of the kernel
+    buffers: "_Buffers | None" = None  #: memory for the most items so far
     lock: Any = field(default_factory=Lock)
 
 
@@ -67,8 +59,7 @@ class FusedEnergy:
 class _Buffers:
     """Memory for all starts of all objects, and a launch for each thread."""
 
-    rows: Tensor
-    """Which items `order` is about."""
+    rows: Tensor  #: which items `order` is about
     order: Tensor
     layout: Tensor
     parts: Tensor

@@ -40,8 +40,7 @@ class _MovedObject:
 
     given: SceneObject
     stays: tuple[Stay, ...]
-    shown: int
-    """The stay that the reference image shows."""
+    shown: int  #: the stay that the reference image shows
 
 
 def reconstruct_moved(

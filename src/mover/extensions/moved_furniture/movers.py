@@ -44,10 +44,8 @@ class Between:
 
     before: SceneObject
     after: SceneObject
-    last: int
-    """Of the frames that surely show it where it stood before."""
-    first: int
-    """Of the frames that surely show it where it stands after."""
+    last: int  #: of the frames that surely show it where it stood before
+    first: int  #: of the frames that surely show it where it stands after
 
 
 @dataclass(frozen=True)
@@ -65,12 +63,9 @@ class _Holds:
     """Where a person could hold something, frame by frame."""
 
     frame: Int[Tensor, " frames"]
-    position: Float[Tensor, "frames 2"]
-    """(x, z) [m]"""
-    heading: Float[Tensor, " frames"]
-    """[rad]"""
-    able: Bool[Tensor, " frames"]
-    """Whether it can be held so: the person sits."""
+    position: Float[Tensor, "frames 2"]  #: (x, z) [m]
+    heading: Float[Tensor, " frames"]  #: [rad]
+    able: Bool[Tensor, " frames"]  #: whether it can be held so: the person sits
 
 
 def follow_mover(

@@ -38,11 +38,9 @@ SECONDS = 1.5  # [s], an object that stands for a shorter time is being moved
 class MoveInputs:
     """The objects and the people in the frames."""
 
-    furniture: People
-    """Visible masks of objects; `person` is the number of an annotation."""
+    furniture: People  #: visible masks of objects; `person` is the number of an annotation
     people: People | None
-    annotations: tuple[int, ...]
-    """Of the objects."""
+    annotations: tuple[int, ...]  #: of the objects
     fps: float | None
 
 
@@ -51,20 +49,16 @@ class Stay:
     """A time in which an object stands."""
 
     annotation: int
-    first: int
-    """Its first frame; the time ends where that of the next begins."""
-    mask: Bool[Tensor, "h w"]
-    """What is seen of it, at a third of the image's resolution."""
-    sure: tuple[int, int]
-    """First and last frame that show it there."""
+    first: int  #: its first frame; the time ends where that of the next begins
+    mask: Bool[Tensor, "h w"]  #: what is seen of it, at a third of the image's resolution
+    sure: tuple[int, int]  #: first and last frame that show it there
 
 
 @record
 class Moves:
     """All stays of the objects that are moved; objects that never are have none."""
 
-    stays: tuple[Stay, ...]
-    """By object and time."""
+    stays: tuple[Stay, ...]  #: by object and time
 
 
 def find_moves(inputs: MoveInputs, config: None = None, observe: Observer = silent) -> Moves:
@@ -101,12 +95,9 @@ def find_moves(inputs: MoveInputs, config: None = None, observe: Observer = sile
 class _ObjectMasks:
     """How one object is seen."""
 
-    furniture: People
-    """Its masks, in the order of their frames."""
-    hidden: Callable[[int], Bool[Tensor, "h w"] | None]
-    """What people hide in a frame."""
-    covered: Callable[[int], Bool[Tensor, "h w"]]
-    """Where a frame may show furniture."""
+    furniture: People  #: its masks, in the order of their frames
+    hidden: Callable[[int], Bool[Tensor, "h w"] | None]  #: what people hide in a frame
+    covered: Callable[[int], Bool[Tensor, "h w"]]  #: where a frame may show furniture
     fps: float | None
 
 
@@ -147,14 +138,10 @@ class _Stretch:
 
     first: int
     last: int
-    sure: int
-    """The last that shows enough of it."""
-    hits: Int[Tensor, "h w"]
-    """In how many frames it is seen."""
-    times: Int[Tensor, "h w"]
-    """In how many it could be seen."""
-    bare: Int[Tensor, "h w"]
-    """In how many it is seen, or nothing else that could hide it."""
+    sure: int  #: the last that shows enough of it
+    hits: Int[Tensor, "h w"]  #: in how many frames it is seen
+    times: Int[Tensor, "h w"]  #: in how many it could be seen
+    bare: Int[Tensor, "h w"]  #: in how many it is seen, or nothing else that could hide it
 
     @property
     def usual(self) -> Bool[Tensor, "h w"]:

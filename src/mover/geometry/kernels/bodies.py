@@ -20,14 +20,10 @@ class Body:
     """One body and the scratch arrays about it."""
 
     faces: wp.array(dtype=wp.vec3i)
-    place: wp.array(dtype=wp.vec3d)
-    """Vertices."""
-    size: wp.vec3i
-    """Places of the box."""
-    low: wp.vec3i
-    """Its first place in the volume."""
-    winding: wp.array3d(dtype=wp.int32)
-    """At first its changes along y, with one place more."""
+    place: wp.array(dtype=wp.vec3d)  #: vertices
+    size: wp.vec3i  #: places of the box
+    low: wp.vec3i  #: its first place in the volume
+    winding: wp.array3d(dtype=wp.int32)  #: at first its changes along y, with one place more
 
 
 @wp.struct
@@ -37,8 +33,7 @@ class Flat:
     x: wp.types.vector(length=3, dtype=wp.int64)
     z: wp.types.vector(length=3, dtype=wp.int64)
     y: wp.vec3d
-    sign: int
-    """0 where it is seen edge-on."""
+    sign: int  #: 0 where it is seen edge-on
 
 
 @wp.func

@@ -14,36 +14,27 @@ STEEP, OUTWARD = 2, 1  # flags of a cut
 class Contour:
     """An edge of the outline and the lines of pixel centres that cut it."""
 
-    v0: int
-    """Its vertices, in the order of the lines, in the item."""
+    v0: int  #: its vertices, in the order of the lines, in the item
     v1: int
-    low: float
-    """Where the lines begin and what a line adds [px]."""
+    low: float  #: where the lines begin and what a line adds [px]
     at: float
     slope: float
-    steep: bool
-    """Cut by rows, else by columns."""
+    steep: bool  #: cut by rows, else by columns
     outward: int
     """Whether the object lies before the edge on those lines: 1, else -1; 0: no object."""
-    first: int
-    """First line."""
-    last: int
-    """Last line."""
+    first: int  #: first line
+    last: int  #: last line
 
 
 @wp.struct
 class Gap:
     """A covered and an uncovered centre with a cut in between."""
 
-    inner: int
-    """Pixels in the item."""
+    inner: int  #: pixels in the item
     outer: int
-    pair: int
-    """Its entry in `pairs` of the item."""
-    place: int
-    """The covered centre along the line [px]."""
-    distance: float
-    """From the covered centre to the cut [px]; negative where there is none."""
+    pair: int  #: its entry in `pairs` of the item
+    place: int  #: the covered centre along the line [px]
+    distance: float  #: from the covered centre to the cut [px]; negative where there is none
 
 
 @wp.func
@@ -123,14 +114,10 @@ def cut_of(scene: Items, item: int, c: Contour, g: Gap, line: int) -> wp.vec4i:
 class Crossing:
     """A cut, computed again from the vertices."""
 
-    target: int
-    """Pixel of the window that the cut moves, over all items; -1: it is in the border."""
-    shift: float
-    """What the cut adds to it."""
-    share: float
-    """Where it cuts the edge, from its first vertex (0) to its second (1)."""
-    slope: float
-    """Its motion along the line for that of the edge's line [px/px]."""
+    target: int  #: pixel of the window that the cut moves, over all items; -1: it is in the border
+    shift: float  #: what the cut adds to it
+    share: float  #: where it cuts the edge, from its first vertex (0) to its second (1)
+    slope: float  #: its motion along the line for that of the edge's line [px/px]
     outward: float
     steep: bool
 

@@ -31,18 +31,12 @@ class Side:
 class Triangle:
     """A triangle cut by rows of pixel centres."""
 
-    across: Side
-    """From the top to the bottom."""
-    upper: Side
-    """From the top to the middle."""
-    lower: Side
-    """From the middle to the bottom."""
-    kink: float
-    """Row of the middle vertex [px]."""
-    first: int
-    """First row."""
-    last: int
-    """Last row; before the first where nothing is drawn."""
+    across: Side  #: from the top to the bottom
+    upper: Side  #: from the top to the middle
+    lower: Side  #: from the middle to the bottom
+    kink: float  #: row of the middle vertex [px]
+    first: int  #: first row
+    last: int  #: last row; before the first where nothing is drawn
 
 
 @wp.func
@@ -115,14 +109,10 @@ def triangle(a: wp.vec3, b: wp.vec3, c: wp.vec3, face: wp.vec3l, box: wp.vec4i) 
 class PixelRun:
     """What a row cuts out of a triangle."""
 
-    first: int
-    """First column."""
-    count: int
-    """Number of columns."""
-    q: float
-    """Inverse depth at the first pixel [1/m]."""
-    step: float
-    """Its change from one pixel to the next [1/m]."""
+    first: int  #: first column
+    count: int  #: number of columns
+    q: float  #: inverse depth at the first pixel [1/m]
+    step: float  #: its change from one pixel to the next [1/m]
 
 
 @wp.func

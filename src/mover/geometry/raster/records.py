@@ -13,20 +13,16 @@ from mover.core.records import record
 class Crops:
     """Pinhole windows of one size, one for each item."""
 
-    K: Float[Tensor, "items 3 3"]
-    """Intrinsics of each window [px of the window]; no skew."""
-    height: int
-    """Rows of each window [px]."""
-    width: int
-    """Columns of each window [px]."""
+    K: Float[Tensor, "items 3 3"]  #: intrinsics of each window [px of the window]; no skew
+    height: int  #: rows of each window [px]
+    width: int  #: columns of each window [px]
 
 
 @record
 class Topology:
     """Padded triangles of closed meshes, counter-clockwise seen from outside."""
 
-    faces: Int[Tensor, "items faces 3"]
-    """Vertices of each triangle; padding is (0, 0, 0)."""
+    faces: Int[Tensor, "items faces 3"]  #: vertices of each triangle; padding is (0, 0, 0)
     edges: Int[Tensor, "items edges 4"]
     """Two vertices and the two faces beside them; padding is zeros."""
 
@@ -67,22 +63,16 @@ class Maps:
 class Cuts:
     """Where the outlines of some items are cut between pixel centres."""
 
-    group: range
-    """The items."""
-    table: Tensor
-    """4 numbers for each cut: see `kernels.scene`."""
-    targets: Tensor
-    """Pixel that each cut moves; negative where it has no gradient."""
+    group: range  #: the items
+    table: Tensor  #: 4 numbers for each cut: see `kernels.scene`
+    targets: Tensor  #: pixel that each cut moves; negative where it has no gradient
 
 
 @dataclass(frozen=True)
 class Trace:
     """What the gradients need to know of a drawing."""
 
-    scene: Any
-    """The items as the kernels read them: `kernels.scene.Items`."""
-    near_face: Tensor
-    """Face that is seen first (items, h, w); unset where not covered."""
-    far_face: Tensor
-    """Face that is seen last (items, h, w); unset where not covered."""
+    scene: Any  #: the items as the kernels read them: `kernels.scene.Items`
+    near_face: Tensor  #: face that is seen first (items, h, w); unset where not covered
+    far_face: Tensor  #: face that is seen last (items, h, w); unset where not covered
     cuts: tuple[Cuts, ...]

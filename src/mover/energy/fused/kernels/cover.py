@@ -24,8 +24,7 @@ class ScreenExtent:
 
     box: wp.vec4i
     """What it may touch: first row, row after the last, the same of columns, in the grid."""
-    left: int
-    """Its leftmost vertex, and so on; the first of equals."""
+    left: int  #: its leftmost vertex, and so on; the first of equals
     top: int
     right: int
     bottom: int

@@ -39,23 +39,17 @@ class ImageData:
     mask: wp.array(dtype=wp.float32)
     gain: wp.array(dtype=wp.float64)
     """What the cost changes by when all pixels of a row before this one are covered."""
-    empty: wp.array(dtype=wp.float64)
-    """Cost of each window in which nothing is drawn."""
-    trust: wp.array(dtype=wp.float32)
-    """Weight of each silhouette."""
-    loose: float
-    """Cost of the square of a shift [1/px^2]."""
+    empty: wp.array(dtype=wp.float64)  #: cost of each window in which nothing is drawn
+    trust: wp.array(dtype=wp.float32)  #: weight of each silhouette
+    loose: float  #: cost of the square of a shift [1/px^2]
     keep: wp.array(dtype=wp.float32)
     lower: wp.array(dtype=wp.float32)
     """Lowest depth, with its slack; infinite where a pixel has no bound at all [m]."""
-    upper: wp.array(dtype=wp.float32)
-    """Highest depth, with its slack [m]."""
+    upper: wp.array(dtype=wp.float32)  #: highest depth, with its slack [m]
     bounded: wp.array(dtype=wp.vec4i)
     """Rows and columns in which depths are bounded, as in `cover.ScreenExtent`."""
-    limit: float
-    """Most that a depth can be out of its bounds [m]."""
-    fewest: float
-    """Pixels by which depths are divided at least."""
+    limit: float  #: most that a depth can be out of its bounds [m]
+    fewest: float  #: pixels by which depths are divided at least
 
 
 @wp.struct
@@ -63,12 +57,10 @@ class HumanData:
     """What the people say."""
 
     field: Field
-    queries: wp.array(dtype=wp.vec3)
-    """Skin that touches, in the world [m]."""
+    queries: wp.array(dtype=wp.vec3)  #: skin that touches, in the world [m]
     share: wp.array(dtype=wp.float32)
     """Its share in the cost of its object; negative: it touches the back."""
-    rho: float
-    """Distance at which contact costs a half [m]."""
+    rho: float  #: distance at which contact costs a half [m]
     top: wp.array2d(dtype=wp.vec3)
     back: wp.array2d(dtype=wp.vec3)
 
@@ -80,74 +72,50 @@ class KernelInput:
     things: ObjectData
     windows: ImageData
     people: HumanData
-    boxes: wp.array(dtype=wp.vec4)
-    """Detected boxes [px]."""
-    within: wp.array(dtype=wp.vec4)
-    """Whether a side is known, and costs."""
-    beyond: wp.array(dtype=wp.vec4)
-    """The most that it costs to stick out of a side."""
+    boxes: wp.array(dtype=wp.vec4)  #: detected boxes [px]
+    within: wp.array(dtype=wp.vec4)  #: whether a side is known, and costs
+    beyond: wp.array(dtype=wp.vec4)  #: the most that it costs to stick out of a side
     facts: wp.array2d(dtype=wp.float32)
-    turn: wp.array(dtype=wp.mat33)
-    """From the world to the camera; one."""
-    lens: wp.vec4
-    """Focal lengths and principal point of the image [px]."""
+    turn: wp.array(dtype=wp.mat33)  #: from the world to the camera; one
+    lens: wp.vec4  #: focal lengths and principal point of the image [px]
     weights: Weights
-    soft: float
-    """Half width of the rounded tip of the cost of a box."""
-    sizes: wp.vec2
-    """Logarithms of the lowest and highest scale that are usual."""
-    growth: float
-    """Cost of another size as a whole, against another shape."""
-    rho: float
-    """Change of the logarithm of the distance that costs a half."""
+    soft: float  #: half width of the rounded tip of the cost of a box
+    sizes: wp.vec2  #: logarithms of the lowest and highest scale that are usual
+    growth: float  #: cost of another size as a whole, against another shape
+    rho: float  #: change of the logarithm of the distance that costs a half
 
 
 @wp.struct
 class Workspace:
     """Working memory of a thread, for one item at a time; all but the lists is zero in between."""
 
-    scene: Items
-    """An item alone: its vertices in camera axes and its window."""
+    scene: Items  #: an item alone: its vertices in camera axes and its window
     scratch: Scratch
     steps: wp.array(dtype=wp.uint8)
     """Change of the number of layers from pixel to pixel, modulo 256."""
-    words: wp.array(dtype=wp.uint64)
-    """The same memory, eight at a time."""
-    seen: wp.array(dtype=wp.uint64)
-    """A bit for each pixel at which a front is seen."""
-    behind: wp.array(dtype=wp.uint64)
-    """A bit for each pixel at which a back is."""
-    stride: int
-    """Steps of a row, a multiple of eight."""
-    across: int
-    """Words of a row of bits."""
-    pairs: wp.array(dtype=wp.int32)
-    """Pair of centres of each cut that may count."""
-    keys: wp.array(dtype=wp.uint64)
-    """Its key."""
+    words: wp.array(dtype=wp.uint64)  #: the same memory, eight at a time
+    seen: wp.array(dtype=wp.uint64)  #: a bit for each pixel at which a front is seen
+    behind: wp.array(dtype=wp.uint64)  #: a bit for each pixel at which a back is
+    stride: int  #: steps of a row, a multiple of eight
+    across: int  #: words of a row of bits
+    pairs: wp.array(dtype=wp.int32)  #: pair of centres of each cut that may count
+    keys: wp.array(dtype=wp.uint64)  #: its key
     crossings: wp.array(dtype=wp.vec4)
     """Of each cut that counts: share, slope, direction outward, 1 where its pixel is covered."""
-    shift: wp.array(dtype=wp.float32)
-    """What the outline adds to a pixel."""
-    moved: wp.array(dtype=wp.float32)
-    """The same for the pixel of each cut that counts."""
-    squares: wp.array(dtype=wp.float64)
-    """Sum of the squares of the silhouette under each shift."""
+    shift: wp.array(dtype=wp.float32)  #: what the outline adds to a pixel
+    moved: wp.array(dtype=wp.float32)  #: the same for the pixel of each cut that counts
+    squares: wp.array(dtype=wp.float64)  #: sum of the squares of the silhouette under each shift
 
 
 @wp.struct
 class ItemCosts:
     """Costs of the items, with their weights, and how they change."""
 
-    order: wp.array(dtype=wp.int32)
-    """In which order the items are taken."""
-    layout: wp.array2d(dtype=wp.float32)
-    """Place, yaw, logarithms of the scale of each item."""
-    parts: wp.array2d(dtype=wp.float32)
-    """Each term of each item."""
+    order: wp.array(dtype=wp.int32)  #: in which order the items are taken
+    layout: wp.array2d(dtype=wp.float32)  #: place, yaw, logarithms of the scale of each item
+    parts: wp.array2d(dtype=wp.float32)  #: each term of each item
     slopes: wp.array(dtype=Slope, ndim=2)
-    whole: wp.array(dtype=wp.float32)
-    """Sum of the terms."""
+    whole: wp.array(dtype=wp.float32)  #: sum of the terms
     slope: wp.array(dtype=Slope)
 
 
@@ -156,17 +124,12 @@ class Pose:
     """Where an item stands; vectors in its own axes have its size but not its place."""
 
     item: int
-    thing: int
-    """The object that it is."""
+    thing: int  #: the object that it is
     scale: wp.vec3
-    turn: wp.mat33
-    """From its own axes to the world."""
-    place: wp.vec3
-    """In the world [m]."""
-    view: wp.mat33
-    """From its own axes to the camera."""
-    origin: wp.vec3
-    """In camera axes [m]."""
+    turn: wp.mat33  #: from its own axes to the world
+    place: wp.vec3  #: in the world [m]
+    view: wp.mat33  #: from its own axes to the camera
+    origin: wp.vec3  #: in camera axes [m]
 
 
 @wp.func
