@@ -71,10 +71,9 @@ RENAMED = {
 def load_plain(path: Path) -> Any:  # noqa: ANN401
     """The content of a pickle as a tree: keys as text; arrays of objects and tuples as lists.
 
-    Understood are numbers, text, containers, numpy arrays, scipy's sparse matrices (csc, csr, coo),
-    chumpy arrays and torch tensors (both become numpy arrays), paths (text); Python 2's text is
-    read as latin1. The file may be a pickle, one of joblib (compressed or not), a torch file of
-    tensors, or an .npy file with an object.
+    Understood are numbers, text, paths (text), containers, arrays of numpy, chumpy and torch (all
+    as numpy's) and scipy's sparse matrices (csc, csr, coo); Python 2's text is latin1. The file may
+    be joblib's (compressed or not), a torch file of tensors, or an .npy file with an object.
 
     Raises:
         InputError: If the file is missing, too large or broken, names any other class, holds
@@ -86,7 +85,9 @@ def load_plain(path: Path) -> Any:  # noqa: ANN401
     try:
         if path.stat().st_size > LARGEST:
             raise InputError(f"has {path.stat().st_size} bytes, expected at most {LARGEST}")
-        return _plain(_loaded(path.read_bytes()), {}, 0)[0]
+        with warnings.catch_warnings():  # of storages that have types, of escapes that are none
+            warnings.simplefilter("ignore")
+            return _plain(_loaded(path.read_bytes()), {}, 0)[0]
     except InputError as error:
         raise InputError(f"{name}: {error}") from error
     except BROKEN_PICKLE as error:
@@ -132,17 +133,15 @@ def _of_archive(data: bytes) -> Any:  # noqa: ANN401
 
 def _of_torch(data: bytes) -> Any:  # noqa: ANN401
     """The content of a torch file."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of storages that have types
-        try:
-            value = torch.load(BytesIO(data), map_location="cpu", weights_only=True)
-        except pickle.UnpicklingError as error:  # its text names the way to run what a file holds
-            named = re.search(r"GLOBAL (\S+)", str(error))
-            held = f"the pickle holds {named[1][:200]}" if named else "is a broken torch file"
-            raise InputError(f"{held}, expected tensors, numbers, text and containers") from error
-        if isinstance(value, torch.storage.TypedStorage):
-            return torch.empty(0, dtype=value.dtype).set_(value)  # pyright: ignore[reportArgumentType]
-        return value
+    try:
+        value = torch.load(BytesIO(data), map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:  # its text names the way to run what a file holds
+        named = re.search(r"GLOBAL (\S+)", str(error))
+        held = f"the pickle holds {named[1][:200]}" if named else "is a broken torch file"
+        raise InputError(f"{held}, expected tensors, numbers, text and containers") from error
+    if isinstance(value, torch.storage.TypedStorage):
+        return torch.empty(0, dtype=value.dtype).set_(value)  # pyright: ignore[reportArgumentType]
+    return value
 
 
 class Row(tuple[Any, ...]):
@@ -202,12 +201,6 @@ class Reader(pickle._Unpickler):  # pyright: ignore[reportPrivateUsage, reportAt
         super().__init__(stream, encoding="latin1")
         self.stream = stream
 
-    def load(self) -> Any:  # noqa: ANN401
-        """The value of one pickle."""
-        with warnings.catch_warnings():  # of escapes that are none, in texts that are broken
-            warnings.simplefilter("ignore", DeprecationWarning)
-            return super().load()
-
     def find_class(self, module: str, name: str) -> Word:
         """The word for a class or function of the list.
 
@@ -255,13 +248,7 @@ class Reader(pickle._Unpickler):  # pyright: ignore[reportPrivateUsage, reportAt
 def _plain(value: Any, done: dict[int, Any], depth: int) -> tuple[Any, int]:  # noqa: ANN401
     """A value as a tree with each call worked out, and its bytes if all that it shares is written.
 
-    Args:
-        value: What a pickle holds.
-        done: What was found for each thing by its id, with the thing, which so keeps its id.
-        depth: Levels above it.
-
-    Raises:
-        InputError: If it holds itself, is too deep or too large.
+    `done` has what was found for each thing by its id, with the thing, which so keeps its id.
     """
     if not isinstance(value, Call | Mapping | list | tuple | set | frozenset):
         value = _array_of(value) if isinstance(value, torch.Tensor) else value
@@ -422,8 +409,9 @@ WORDS = {
 """What a pickle may name, but not call; but for copyreg's two, see `Word`."""
 MADE: Mapping[str, Callable[..., Any]] = {
     **dict.fromkeys((*SETS, "builtins.list", "builtins.tuple", "torch.Size"), _list),
-    **dict.fromkeys(("builtins.dict", "collections.OrderedDict"), _mapping),
-    "collections.defaultdict": _mapping,
+    **dict.fromkeys(
+        ("builtins.dict", "collections.OrderedDict", "collections.defaultdict"), _mapping
+    ),
     **dict.fromkeys(("builtins.bytes", "builtins.bytearray", "_codecs.encode"), _bytes),
     "builtins.complex": lambda _, args, *__: complex(*args),
     **dict.fromkeys(
