@@ -12,6 +12,7 @@ from mover.bodies.skeleton import BODY
 from mover.core.records import record
 from mover.core.types import Bodies, Camera
 from mover.evaluate.scene import Metric
+from mover.geometry.rotations import similarity
 from mover.io.capture.pose_file import into_camera
 from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
 from mover.stages.config import FootContactConfig
@@ -128,14 +129,8 @@ def procrustes(
     points: Float[Tensor, "*batch points 3"], target: Float[Tensor, "*batch points 3"]
 ) -> Float[Tensor, "*batch points 3"]:
     """The points after the rotation, scale and shift that bring them nearest to the target."""
-    center, goal = points.mean(-2, keepdim=True), target.mean(-2, keepdim=True)
-    source, aim = points - center, target - goal
-    u, s, vt = torch.linalg.svd(source.mT @ aim)
-    last = torch.where(torch.linalg.det(u @ vt) < 0, -1.0, 1.0).to(points)
-    signs = torch.stack([torch.ones_like(last), torch.ones_like(last), last], -1)
-    spread = source.square().sum((-2, -1)).clamp_min(torch.finfo(points.dtype).tiny)
-    scale = (s * signs).sum(-1) / spread
-    return scale[..., None, None] * (source @ ((u * signs.unsqueeze(-2)) @ vt)) + goal
+    size, turn, shift = similarity(points, target)
+    return size[..., None, None] * points @ turn.mT + shift.unsqueeze(-2)
 
 
 def shared_rows(bodies: Bodies, truth: Bodies) -> tuple[Int[Tensor, " rows"], Int[Tensor, " rows"]]:

@@ -1,4 +1,4 @@
-"""Rotations: about the axes of the world, from axis-angle vectors, and between directions."""
+"""Rotations: about the axes of the world, from axis-angle vectors, and between sets of points."""
 
 import numpy as np
 import torch
@@ -53,6 +53,20 @@ def affine(
     out = np.tile(np.eye(4), (*A.shape[:-2], 1, 1))
     out[..., :3, :3], out[..., :3, 3] = A, t
     return out
+
+
+def similarity(
+    start: Float[Tensor, "*batch points 3"], end: Float[Tensor, "*batch points 3"]
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3"]]:
+    """Size, rotation and shift that bring points nearest to others (Umeyama); never a mirror."""
+    a, b = start.mean(-2, keepdim=True), end.mean(-2, keepdim=True)
+    u, s, vt = torch.linalg.svd((end - b).mT @ (start - a))
+    flip = torch.ones_like(s)
+    flip[..., 2] = torch.where(torch.linalg.det(u @ vt) < 0, -1.0, 1.0)
+    turn = u @ (flip[..., None] * vt)
+    spread = (start - a).square().sum((-2, -1)).clamp_min(torch.finfo(start.dtype).tiny)
+    size = (s * flip).sum(-1) / spread
+    return size, turn, (b - size[..., None, None] * a @ turn.mT).squeeze(-2)
 
 
 def wrap(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:

@@ -155,6 +155,13 @@ def joined_bodies(parts: Sequence[Bodies]) -> Bodies:
 # Parameters of bodies: posed, and moved as rigid bodies, whose root turns about the pelvis.
 
 
+def pelvis_of(pose: BodyPose) -> Float[Tensor, "bodies 3"]:
+    """From `transl` to the pelvis, about which the root turns [m]."""
+    zero = torch.zeros_like(pose.transl)
+    rest = dataclasses.replace(pose, transl=zero, global_orient=zero)
+    return run_model(load_model(pose.model, pose.gender), rest)[1][:, 0]
+
+
 def moved(pose: BodyPose, R: Float[Tensor, "bodies 3 3"], t: Float[Tensor, "bodies 3"]) -> BodyPose:
     """The parameters of the bodies x' = R x + t; NaN stays NaN.
 
@@ -163,9 +170,7 @@ def moved(pose: BodyPose, R: Float[Tensor, "bodies 3 3"], t: Float[Tensor, "bodi
     """
     if (R - torch.eye(3).to(R)).abs().nan_to_num(0).amax() < NO_TURN:
         return dataclasses.replace(pose, transl=pose.transl + t)
-    zero = torch.zeros_like(pose.transl)
-    rest = dataclasses.replace(pose, transl=zero, global_orient=zero)
-    offset = run_model(load_model(pose.model, pose.gender), rest)[1][:, 0]  # `transl` to pelvis
+    offset = pelvis_of(pose)
     place = (R @ (offset + pose.transl)[..., None])[..., 0] + t - offset
     whole = (R.double() @ axis_angle(pose.global_orient.double())).numpy()
     root = torch.from_numpy(vectors(whole, At(whole, "the camera"))).to(pose.global_orient)

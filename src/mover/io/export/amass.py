@@ -1,6 +1,5 @@
 """Bodies as AMASS and the tools around SMPL-X keep them: one npz a person."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +9,10 @@ from numpy.typing import NDArray
 
 from mover.core.errors import InputError
 from mover.core.types import Bodies
-from mover.geometry.rotations import axis_angle, rot_x, rotation_vectors
+from mover.geometry.rotations import rot_x
+from mover.io.capture.pose_file import moved
 from mover.io.export.finished import Exported, Finished, Track, Up, clock_of, tracks_of
-from mover.io.export.posed import Motion, all_angles, misses, motion_of, pelvis_of, skin_of
+from mover.io.export.posed import Motion, all_angles, misses, motion_of, skin_of
 from mover.io.files.npz import write_npz
 
 PARTS = {"pose_body": (3, 66), "pose_jaw": (66, 69), "pose_eye": (69, 75), "pose_hand": (75, 165)}
@@ -36,12 +36,9 @@ def export_amass(finished: Finished, folder: Path, up: Up = "y") -> Exported:
     if float((motion.size - 1).abs().max()) > 1e-3:
         sizes = f"{float(motion.size.min()):.3f} to {float(motion.size.max()):.3f}"
         notes.append(f"bodies are {sizes} times the size that their betas say ('size')")
-    if up == "z":  # the root turns about the pelvis
-        pose, turn = motion.pose, rot_x(torch.tensor(torch.pi / 2))
-        offset = pelvis_of(pose)
-        position = (pose.transl + offset) @ turn.mT - offset
-        root = rotation_vectors(turn @ axis_angle(pose.global_orient))
-        motion = Motion(replace(pose, transl=position, global_orient=root), motion.size)
+    if up == "z":
+        turn = rot_x(torch.tensor(torch.pi / 2)).expand(len(motion.size), 3, 3)
+        motion = Motion(moved(motion.pose, turn, torch.zeros(len(motion.size), 3)), motion.size)
     for track in tracks_of(bodies):
         files.append(folder / f"amass_{track.person}.npz")
         write_npz({**_arrays(motion, track, bodies), "up_axis": np.array(up)}, files[-1])

@@ -11,7 +11,8 @@ from mover.bodies.skinning import SkinnedBody
 from mover.core.errors import InputError
 from mover.core.records import record, rows_of
 from mover.core.types import Bodies, BodyPose
-from mover.geometry.rotations import axis_angle, rotation_vectors
+from mover.geometry.rotations import axis_angle, rotation_vectors, similarity
+from mover.io.capture.pose_file import pelvis_of
 from mover.io.export.finished import BodyForm, Finished, tracks_of
 
 SAME = 0.01  # [m], a similarity that leaves more did not make the result's body
@@ -48,9 +49,11 @@ def motion_of(finished: Finished) -> Motion | str:
     if not (same and (given.frame == bodies.frame).all() and (given.person == bodies.person).all()):
         return "the capture's bodies are not those of the result"
     pose = given.pose
-    size, turn, shift, error = similarity(given.verts.double(), bodies.verts.double())
-    if float(error.max()) > SAME:
-        return f"the result's bodies are not those of the capture, by {float(error.max()):.3f} m"
+    start, end = given.verts.double(), bodies.verts.double()
+    size, turn, shift = similarity(start, end)
+    miss = size[:, None, None] * start @ turn.mT + shift[:, None] - end
+    if (off := float(miss.norm(dim=-1).max())) > SAME:
+        return f"the result's bodies are not those of the capture, by {off:.3f} m"
     offset = pelvis_of(pose)
     pelvis = (pose.transl + offset).double()
     there = size[:, None] * (turn @ pelvis[..., None])[..., 0] + shift
@@ -59,34 +62,6 @@ def motion_of(finished: Finished) -> Motion | str:
         pose, global_orient=root.to(pose.transl), transl=there.to(pose.transl) - offset
     )
     return Motion(moved, size.to(pose.transl))
-
-
-def pelvis_of(pose: BodyPose) -> Float[Tensor, "bodies 3"]:
-    """From `transl` to the pelvis, about which the root turns [m]."""
-    straight = {name: torch.zeros_like(getattr(pose, name)) for name in ("transl", "global_orient")}
-    _, joints = load_model(pose.model, pose.gender).posed(dataclasses.replace(pose, **straight))
-    return joints[:, 0]
-
-
-def similarity(
-    start: Float[Tensor, "rows points 3"], end: Float[Tensor, "rows points 3"]
-) -> tuple[
-    Float[Tensor, " rows"],
-    Float[Tensor, "rows 3 3"],
-    Float[Tensor, "rows 3"],
-    Float[Tensor, " rows"],
-]:
-    """Size, rotation and shift that best carry `start` to `end`, and the largest miss [m]."""
-    a, b = start.mean(1, keepdim=True), end.mean(1, keepdim=True)
-    cross = (end - b).mT @ (start - a)
-    u, s, vt = torch.linalg.svd(cross)
-    flip = torch.ones_like(s)
-    flip[:, 2] = (torch.linalg.det(u) * torch.linalg.det(vt)).sign()
-    turn = u @ (flip[..., None] * vt)
-    size = (s * flip).sum(-1) / (start - a).square().sum((1, 2)).clamp_min(1e-12)
-    shift = (b - size[:, None, None] * a @ turn.mT)[:, 0]
-    miss = size[:, None, None] * start @ turn.mT + shift[:, None] - end
-    return size, turn, shift, miss.norm(dim=-1).amax(-1)
 
 
 def all_angles(pose: BodyPose) -> Float[Tensor, "bodies joints 3"]:
