@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mover.geometry.camera import NEAR
-from mover.geometry.raster.records import Crops, Depths, Layers, Topology
+from mover.geometry.raster.draw import Crops, Depths, Layers, Topology
 
 BORDER = 1  # [px], as in the kernels
 TINY = 1e-12  # [px], keeps the slope of level edges finite; their rows use its sign only

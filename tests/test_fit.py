@@ -16,8 +16,7 @@ from mover.bodies.skinning import heights_of, open_body, shaped, zero_pose
 from mover.bodies.smpl_files import load_smpl
 from mover.core.errors import InputError
 from mover.core.types import Scene
-from mover.energy.body_energy import BODY_TERMS
-from mover.energy.body_terms import deviation_term, robust_square, second_difference
+from mover.energy.body_terms import BODY_TERMS, deviation_term, robust_square, second_difference
 from mover.fitting import priors
 from mover.fitting.bodies import FitInputs, fit_bodies
 from mover.fitting.config import PAPER, PUBLISHED, STAGES, FitConfig, Stage

@@ -12,8 +12,7 @@ from make_keypoints import CAMERA, as_bodies, keypoints_at, seen, walker
 from mover.bodies.skeleton import BODY
 from mover.bodies.skinning import growth_of, open_body
 from mover.core.types import Bodies
-from mover.energy.body_energy import BODY_TERMS
-from mover.energy.body_terms import SIGMA_HELD, deviation_term, robust_square
+from mover.energy.body_terms import BODY_TERMS, SIGMA_HELD, deviation_term, robust_square
 from mover.evaluate.bodies import procrustes
 from mover.fitting import ground
 from mover.fitting.bodies import FitInputs, fit_bodies

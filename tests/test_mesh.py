@@ -14,9 +14,9 @@ from torch import Tensor
 from mover.bodies.skinning import open_body, zero_pose
 from mover.core.types import Mesh
 from mover.geometry import mesh as m
+from mover.geometry.mesh import coarser, farthest_first
 from mover.geometry.nearest import nearest_points, to_surface
 from mover.geometry.rotations import axis_angle
-from mover.geometry.thinning import coarser, farthest_first
 from mover.geometry.topology import manifold
 
 

@@ -9,7 +9,7 @@ from reference import use_engine
 
 from mover.core.types import Layout
 from mover.energy import objective
-from mover.energy.body_energy import BODY_TERMS
+from mover.energy.body_terms import BODY_TERMS
 from mover.energy.config import BodyWeights, SceneConfig, SceneWeights, only
 from mover.energy.fused import energy
 from mover.energy.fused.energy import energy_function, energy_of_rows

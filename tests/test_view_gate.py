@@ -10,7 +10,7 @@ from threading import Event, Thread
 
 import pytest
 
-from mover.app.viewer.gate import guarded
+from mover.app.viewer.show import guarded
 
 websockets = pytest.importorskip("websockets")
 UPGRADE = {

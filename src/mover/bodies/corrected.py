@@ -15,9 +15,8 @@ from mover.core.errors import InputError
 from mover.core.records import map_tensors, record
 from mover.core.types import Bodies, BodyPose, Camera
 from mover.geometry.camera import to_world
-from mover.geometry.mesh import vertex_normals
+from mover.geometry.mesh import farthest_first, vertex_normals
 from mover.geometry.rotations import axis_angle, rotation_vectors
-from mover.geometry.thinning import farthest_first
 
 MEAN_SHAPE = 0.05  # shape coefficients below it are the mean shape
 LOOSE_POINTS = 16  # vertices that stand for the joints of a body without any

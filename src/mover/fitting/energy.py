@@ -14,8 +14,7 @@ from torch import Tensor
 from mover.bodies.skeleton import BODY
 from mover.core.observe import Energy
 from mover.core.records import record
-from mover.energy.body_energy import body_energy
-from mover.energy.body_terms import Neighbours
+from mover.energy.body_terms import Neighbours, body_energy
 from mover.energy.config import BodyWeights
 from mover.fitting import ground
 from mover.fitting.config import FitConfig, Stage

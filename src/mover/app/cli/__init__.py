@@ -14,7 +14,7 @@ from typing import Any
 from mover.core.errors import InputError
 
 COMMANDS = {
-    "demo": ("mover.app.cli.demo:demo",
+    "demo": ("mover.app.cli.run:demo",
         "Reconstruct a known room that comes with the package, compare it with the truth."),
     "video": ("mover.app.cli.video:video",
         "From a video or a picture to a room: pictures, bodies, first scene, room, report."),

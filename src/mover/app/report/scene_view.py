@@ -12,8 +12,8 @@ from torch import Tensor
 
 from mover.core.colours import colour, css, person_colour
 from mover.core.types import Bodies, Mesh, Scene
+from mover.geometry.mesh import chosen_vertices, simplifying
 from mover.geometry.placement import place_object
-from mover.geometry.thinning import chosen_vertices, simplifying
 
 GRAIN = 1e-4  # share of the longest side within which vertices are the same
 FACES_OBJECT, FACES_BODY = 3000, 1600  # at most

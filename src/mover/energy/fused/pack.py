@@ -10,6 +10,7 @@ from mover.energy import human_terms, image_terms, prior_terms
 from mover.energy.config import SceneConfig, SceneWeights
 from mover.energy.fused.launch import BORDER, FUSED, BufferSize, FusedEnergy
 from mover.energy.objective import HumanCues, ImageCues, SceneEvidence
+from mover.geometry.raster.draw import windows as lens_of
 from mover.geometry.volume import field_of
 from mover.geometry.warp_start import array, started
 
@@ -82,10 +83,8 @@ def _windows(image: ImageCues, humans: HumanCues, weights: SceneWeights) -> Any:
     from mover.energy.fused.kernels.data import ImageData
 
     views, windows = image.views, ImageData()
-    K = views.K.detach()
-    lens = torch.stack([K[:, 0, 0], K[:, 1, 1], K[:, 0, 2] + BORDER, K[:, 1, 2] + BORDER], -1)
     mask, keep = image.masks.detach(), image.keep.to(image.masks)
-    windows.lens = array(lens.contiguous(), "vec4")
+    windows.lens = array(lens_of(views.K.detach(), BORDER), "vec4")
     shifts, masks = mask.new_zeros(1), mask.unsqueeze(0)
     if image.borders is not None:
         shifts, masks = image.borders.shifts, image.borders.masks.detach()

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mover.geometry.raster import draw
-from mover.geometry.raster.records import Crops, Depths, Layers, Maps, Topology
+from mover.geometry.raster.draw import Crops, Depths, Layers, Maps, Topology
 
 __all__ = [
     "Crops", "Depths", "Layers", "Topology",

@@ -30,9 +30,9 @@ from mover.energy.image_terms import WIDTH
 from mover.energy.objective import HumanCues
 from mover.geometry.camera import to_camera
 from mover.geometry.crops import sample_nearest
+from mover.geometry.mesh import coarser
 from mover.geometry.path import is_still, poses_at, resampled
 from mover.geometry.raster import Crops, Topology, depths, layers
-from mover.geometry.thinning import coarser
 from mover.geometry.volume import grid_around
 from mover.geometry.volume_warp import union_bodies
 from mover.stages.config import GatherConfig

@@ -31,12 +31,12 @@ from mover.core.observe import Energy, Observer, silent
 from mover.core.records import map_tensors, record, rows_of, with_rows
 from mover.core.types import Bodies, Camera, Capture, Room
 from mover.energy.body_contact import Matches, Skin, gather_matches
-from mover.energy.body_energy import body_energy
 from mover.energy.body_terms import (
     ANGLE,
     Bounds,
     Neighbours,
     Outline,
+    body_energy,
     depth_share,
     gather_neighbours,
 )
