@@ -75,14 +75,20 @@ def errors(found):
     return np.array([math.degrees(pitch - PITCH), math.degrees(roll - ROLL), found.ground - GROUND])
 
 
-def align(soles, camera, ground=None, height=None, config=ROBUST):
-    return align_camera(AlignInputs(soles, camera, ground, height), config)
+def align(soles, off, ground=None, height=None, config=ROBUST, **more):
+    """From a camera that is so many degrees off."""
+    return align_camera(AlignInputs(soles, camera_off(off), ground, height, **more), config)
+
+
+def spread_of(found):
+    """Of pitch and roll [degrees] and ground [m]."""
+    return found.covariance.diag().sqrt().numpy() * [180 / math.pi, 180 / math.pi, 1]
 
 
 @pytest.mark.parametrize("config", [AlignConfig(), PAPER], ids=["robust", "paper"])
 @pytest.mark.parametrize("off", [(3.0, -4.0), (-4.0, 3.0), (20.0, -8.0)])
 def test_a_clean_floor_is_found_from_any_guess(config, off):
-    found = align(soles_at(room()), camera_off(off), config=config)
+    found = align(soles_at(room()), off, config=config)
     assert np.abs(errors(found)).max() < 0.02
     assert abs(errors(found)[2]) < 0.001
 
@@ -90,7 +96,7 @@ def test_a_clean_floor_is_found_from_any_guess(config, off):
 @pytest.mark.parametrize("ground", [None, -1.2, 0.4])
 def test_outliers_and_a_wrong_ground_do_no_harm(ground):
     walked = soles_at(room(80), frames=2, noise=0.005, wrong=0.25)
-    pitch, roll, floor = np.abs(errors(align(walked, camera_off((3.0, -3.0)), ground)))
+    pitch, roll, floor = np.abs(errors(align(walked, (3.0, -3.0), ground)))
     assert max(pitch, roll) < 0.1
     assert floor < 0.005
 
@@ -100,7 +106,7 @@ def test_outliers_and_a_wrong_ground_do_no_harm(ground):
 def test_a_straight_walk_is_never_worse_than_the_guess(spots, seed):
     sign = (-1.0) ** seed, 1.0
     off = 3 * sign[0], 3 * sign[1]
-    found = align(soles_at(spots, seed=seed, noise=0.01), camera_off(off))
+    found = align(soles_at(spots, seed=seed, noise=0.01), off)
     assert np.linalg.norm(errors(found)[:2]) < np.linalg.norm(off)
     assert np.abs(errors(found)[:2]).max() < 3.6
     assert len(found.warnings) == 1
@@ -109,7 +115,7 @@ def test_a_straight_walk_is_never_worse_than_the_guess(spots, seed):
 
 @pytest.mark.parametrize("config", [AlignConfig(), PAPER], ids=["robust", "paper"])
 def test_one_frame_moves_only_the_ground(config):
-    found = align(soles_at([(0.3, -3.0)], frames=1), camera_off((3.0, -2.0)), config=config)
+    found = align(soles_at([(0.3, -3.0)], frames=1), (3.0, -2.0), config=config)
     if config is not PAPER:  # the paper has no prior: any tilt through four points is as good
         assert np.abs(errors(found)[:2] - [3, -2]).max() < 0.1
     world = soles_at([(0.3, -3.0)], frames=1).points_cam @ found.camera.R_cam_world
@@ -127,7 +133,7 @@ def test_two_people_with_opposite_depth_bias_are_never_worse_than_the_guess(bias
         soles_at(side, noise=0.01, person=4, bias=bias),
         soles_at(other, noise=0.01, person=9, bias=-bias, seed=5),
     )
-    found = align(soles, camera_off((2.0, -2.0)))
+    found = align(soles, (2.0, -2.0))
     assert np.abs(errors(found)[:2]).max() < (1.8 if apart else 0.4)
     assert abs(errors(found)[2]) < 0.02
     assert found.offsets.keys() == {"4", "9"}
@@ -142,9 +148,8 @@ def test_the_covariance_is_calibrated(frames, noise):
     rng, scores = np.random.default_rng(3), []
     for seed in range(200):
         soles = soles_at(room(15, seed), seed=seed + 999, frames=frames, noise=noise)
-        found = align(soles, camera_off(rng.normal(0, 3, 2)))
-        spread = found.covariance.diag().sqrt().numpy() * [180 / math.pi, 180 / math.pi, 1]
-        scores.append(np.abs(errors(found)) < 1.645 * spread)
+        found = align(soles, rng.normal(0, 3, 2))
+        scores.append(np.abs(errors(found)) < 1.645 * spread_of(found))
     assert (np.mean(scores, 0) >= 0.80).all()
     assert (np.mean(scores, 0) <= 0.97).all()
 
@@ -159,10 +164,10 @@ def leaning(soles, slope):
 @pytest.mark.parametrize("slope", [-0.007, 0.007])
 def test_a_floor_that_leans_as_a_whole_is_set_right_by_a_tilt_that_is_observed(slope):
     observed, soles = math.radians(0.3), leaning(soles_at(room(30), noise=0.01), slope)
-    alone = errors(align(soles, camera_off((0.1, -0.1))))
+    alone = errors(align(soles, (0.1, -0.1)))
     assert abs(alone[0]) > 0.4  # and states a tenth of that
     fixed, free = (
-        align_camera(AlignInputs(soles, camera_off((0.1, -0.1)), None, None, observed, lean))
+        align(soles, (0.1, -0.1), tilt_spread=observed, lean=lean)
         for lean in (0.0, math.radians(0.5))
     )
     assert abs(errors(free)[0]) < 0.2 < abs(errors(fixed)[0])
@@ -173,10 +178,7 @@ def test_a_floor_that_leans_as_a_whole_is_set_right_by_a_tilt_that_is_observed(s
 
 def test_a_lean_that_all_feet_share_is_in_the_covariance():
     lean, soles = math.radians(2.0), soles_at(room(), noise=0.01)
-    plain, shared = (
-        align_camera(AlignInputs(soles, camera_off((0.5, -0.5)), None, None, None, value))
-        for value in (0.0, lean)
-    )
+    plain, shared = (align(soles, (0.5, -0.5), lean=value) for value in (0.0, lean))
     assert bool((shared.covariance.diag()[:2].sqrt() > 0.6 * lean).all())
     assert bool((plain.covariance.diag()[:2].sqrt() < 0.3 * lean).all())
     # the plane turns about the middle of the feet: pitch and ground err together
@@ -191,7 +193,7 @@ def test_a_lean_that_all_feet_share_is_in_the_covariance():
 @pytest.mark.parametrize("turn", [(1.5, 0.0), (-1.5, 1.0), (0.0, 0.0)])
 def test_the_ground_under_another_tilt_is_where_the_same_feet_are(turn):
     soles = soles_at(room(), noise=0.01)
-    found = align_camera(AlignInputs(soles, camera_off((0.5, -0.5)), None, None, None, 0.035))
+    found = align(soles, (0.5, -0.5), tilt_spread=0.035)
     pitch, roll = (float(x) for x in pitch_roll(found.camera.R_cam_world))
     at = [torch.tensor(x + math.radians(t)) for x, t in zip((pitch, roll), turn, strict=True)]
     R = tilted(at[0], at[1])
@@ -210,15 +212,14 @@ def test_frames_of_one_pose_are_no_new_evidence():
     ]
     stood = joined(*parts)
     stood = FootContacts(stood.points_cam, stood.person, torch.arange(len(stood.person)) // 4, ())
-    found = align(stood, camera_off((2.0, 2.0)))
-    spread = found.covariance.diag().sqrt().numpy() * [180 / math.pi, 180 / math.pi, 1]
-    assert (np.abs(errors(found)) < 2.5 * spread).all()
-    assert spread[1] > 0.2
+    found = align(stood, (2.0, 2.0))
+    assert (np.abs(errors(found)) < 2.5 * spread_of(found)).all()
+    assert spread_of(found)[1] > 0.2
 
 
 def test_a_known_camera_height_is_the_ground_and_people_of_a_wrong_size_are_reported():
     soles = soles_at(room(), noise=0.005, bias=-0.08)
-    found = align(soles, camera_off((2.0, -2.0)), height=-GROUND)
+    found = align(soles, (2.0, -2.0), height=-GROUND)
     assert found.ground == GROUND
     assert np.abs(errors(found)[:2]).max() < 0.5
     assert found.offsets["0"] == pytest.approx(-0.08, abs=0.015)
@@ -229,7 +230,7 @@ def test_without_feet_everything_stays_and_a_warning_says_so():
     none = torch.zeros(0, dtype=torch.long)
     soles = FootContacts(torch.zeros(0, 3), none, none, ())
     for ground, height, expected in ((-1.3, None, -1.3), (-1.3, 1.4, -1.4), (None, None, -1.5)):
-        found = align(soles, camera_off((1.0, 2.0)), ground, height)
+        found = align(soles, (1.0, 2.0), ground, height)
         assert np.allclose(errors(found)[:2], [1, 2], atol=1e-4)
         assert found.ground == expected
         assert "no feet" in found.warnings[0]

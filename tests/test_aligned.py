@@ -13,17 +13,13 @@ from mover.geometry.rotations import rot_y
 
 def grown(scene: Scene, scale: float, yaw: float, step: tuple[float, float, float]) -> Scene:
     """The scene after an upright similarity."""
-    pieces = tuple(
-        replace(
-            p,
-            t_world_object=scale * (rot_y(torch.tensor(yaw).double()) @ p.t_world_object)
-            + torch.tensor(step),
-            yaw=p.yaw + yaw,
-            scale=p.scale * scale,
-        )
+    turn = scale * rot_y(torch.tensor(yaw).double())
+    pieces = [
+        replace(p, t_world_object=turn @ p.t_world_object + torch.tensor(step),
+                yaw=p.yaw + yaw, scale=p.scale * scale)
         for p in scene.objects
-    )
-    return replace(scene, objects=pieces)
+    ]  # fmt: skip
+    return replace(scene, objects=tuple(pieces))
 
 
 def moved(scene: Scene, index: int, z: float) -> Scene:
@@ -47,10 +43,8 @@ def test_two_objects_fit_always_so_that_they_say_nothing() -> None:
 
 def test_a_missing_object_counts_as_none_after_the_similarity_too() -> None:
     truth = room()
-    more = replace(truth, objects=(*truth.objects, moved(truth, 0, 1.5).objects[0]))
-    more = replace(
-        more, objects=(*more.objects[:-1], replace(more.objects[-1], id="other", annotation=None))
-    )
+    other = replace(moved(truth, 0, 1.5).objects[0], id="other", annotation=None)
+    more = replace(truth, objects=(*truth.objects, other))
     found = evaluate(truth, truth, more)["result"]
     assert found["iou3d_aligned"] == pytest.approx(len(truth.objects) / len(more.objects), abs=1e-4)
 

@@ -13,16 +13,11 @@ from mover.geometry.rle import encode
 from mover.stages.contacts.diagnostics import DiagnosticInputs, diagnostics
 
 
-def inputs_with(seated, touches=None, masks=None):
-    room = make_inputs(size=16)
-    bodies = people(pose(SEATED, 6), fps=5.0)
-    layout = replace(
-        room.starts, t_world_object=room.starts.t_world_object[0], yaw=room.starts.yaw[0],
-        log_scale=room.starts.log_scale[0],
-    )  # fmt: skip
+def inputs_with(seated, touches=None, masks=None, count=6):
+    room, bodies = make_inputs(size=16), people(pose(SEATED, count), fps=5.0)
     return DiagnosticInputs(
-        bodies, parts_of(bodies), masks, room.camera, room.objects, layout, touches,
-        torch.full((6,), seated),
+        bodies, parts_of(bodies), masks, room.camera, room.objects, room.starts[0], touches,
+        torch.full((count,), seated),
     )  # fmt: skip
 
 
@@ -46,16 +41,7 @@ def test_a_seat_of_another_height_than_its_sitters_is_named(lift, side):
 
 def test_hidden_legs_are_named():
     blank = encode(torch.zeros(360, 640, dtype=torch.bool))
-    rows = torch.arange(6)
-    masks = People(Masks(360, 640, (blank,) * 6), rows, torch.zeros(6, dtype=torch.long), {})
-    found = inputs_with(seated=True, masks=masks)
-    many = replace(
-        found, bodies=replace(found.bodies, verts=found.bodies.verts.repeat(3, 1, 1),
-                              frame=torch.arange(18), person=torch.zeros(18, dtype=torch.long),
-                              pose=None),
-        people=People(Masks(360, 640, (blank,) * 18), torch.arange(18),
-                      torch.zeros(18, dtype=torch.long), {}),
-        seated_on=torch.ones(18, dtype=torch.bool),
-    )  # fmt: skip
-    (text,) = diagnostics(many)
+    rows = torch.arange(18)
+    masks = People(Masks(360, 640, (blank,) * 18), rows, 0 * rows, {})
+    (text,) = diagnostics(inputs_with(seated=True, masks=masks, count=18))
     assert "lower body of person 0 is hidden" in text

@@ -42,18 +42,6 @@ def ends_finite(capture: Capture, folder: Path) -> None:
         assert value.isfinite().all()
 
 
-def behind(capture: Capture) -> torch.Tensor:
-    """A place three metres behind the camera."""
-    place = torch.tensor([0.0, -1.4, 3.0])
-    assert to_camera(place[None], capture.scene.camera.R_cam_world)[0, 2] < -1
-    return place
-
-
-def test_a_mesh_of_one_triangle(capture, tmp_path):
-    one = Mesh(torch.tensor([[0.0, 0, 0], [0.5, 0, 0], [0, 0.8, 0]]), torch.tensor([[0, 1, 2]]))
-    ends_finite(changed(capture, mesh=one), tmp_path)
-
-
 def test_a_mesh_of_half_a_million_faces(capture, tmp_path):
     import trimesh
 
@@ -66,13 +54,19 @@ def test_a_mesh_of_half_a_million_faces(capture, tmp_path):
     ends_finite(changed(capture, mesh=mesh), tmp_path)
 
 
-def test_an_object_behind_the_camera(capture, tmp_path):
-    ends_finite(changed(capture, t_world_object=behind(capture)), tmp_path)
+TRIANGLE = Mesh(torch.tensor([[0.0, 0, 0], [0.5, 0, 0], [0, 0.8, 0]]), torch.tensor([[0, 1, 2]]))
+OBJECTS = {
+    "a mesh of one triangle": {"mesh": TRIANGLE},
+    "behind the camera": {"t_world_object": torch.tensor([0.0, -1.4, 3.0])},
+    "outside of the image": {"t_world_object": torch.tensor([40.0, -1.4, -3.0])},
+}
 
 
-def test_an_object_outside_of_the_image(capture, tmp_path):
-    place = torch.tensor([40.0, -1.4, -3.0])
-    ends_finite(changed(capture, t_world_object=place), tmp_path)
+@pytest.mark.parametrize("name", OBJECTS)
+def test_an_object(name, capture, tmp_path):
+    behind = to_camera(torch.tensor([[0.0, -1.4, 3.0]]), capture.scene.camera.R_cam_world)
+    assert behind[0, 2] < -1
+    ends_finite(changed(capture, **OBJECTS[name]), tmp_path)
 
 
 def test_bodies_behind_the_camera(capture, tmp_path):

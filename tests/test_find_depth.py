@@ -39,23 +39,14 @@ CAMERA = Camera(K, tilted(torch.tensor(math.radians(-8)), torch.tensor(0.0)), SI
 QUICK = DepthConfig(factors=13, width=160)
 
 
-def film(spots, person=0, scale=1.0):
+def film(spots, person=0):
     """Bodies in several poses at several places, in camera axes."""
     turns = (ARMS_DOWN, SEATED, STRIDE, AT_TABLE)
     verts = torch.cat([people(pose(turns[i % 4]), floor=-1.3).verts for i in range(len(spots))])
     verts = verts + torch.tensor([[x, 0.0, z] for x, z in spots])[:, None]
-    rows = torch.arange(len(spots))
-    return Bodies(
-        verts=verts @ CAMERA.R_cam_world.mT * scale,
-        faces=open_body().faces,
-        joints=None,
-        joint_names=(),
-        frame=rows,
-        person=torch.full_like(rows, person),
-        fps=5.0,
-        space="camera",
-        pose=None,
-    )
+    rows, verts = torch.arange(len(spots)), verts @ CAMERA.R_cam_world.mT
+    person = torch.full_like(rows, person)
+    return Bodies(verts, open_body().faces, None, (), rows, person, 5.0, "camera", None)
 
 
 def spots(n=8, seed=0):
@@ -83,6 +74,12 @@ def inputs_of(bodies, seen, objects=()):
     keep = torch.ones(len(bodies.frame), dtype=torch.bool)
     objects = Masks(*SIZE, tuple(encode(m) for m in objects))
     return DepthInputs(bodies, parts_of(bodies), keep, seen, Cover(objects), CAMERA)
+
+
+def found_factor(true, bias, **masks):
+    """Of bodies that are nearer or farther than their masks show."""
+    found = find_depth(inputs_of(moved(true, bias), masks_of(true, **masks)), QUICK)
+    return float(found.factor[0])
 
 
 def table():
@@ -120,16 +117,13 @@ def test_each_person_has_a_factor_of_its_own_and_true_bodies_stay():
 
 @pytest.mark.parametrize("grow", [-1, 0, 1])
 def test_masks_that_are_too_wide_or_too_narrow_do_not_move_people(grow):
-    true = film(spots())
-    found = find_depth(inputs_of(moved(true, 1.02), masks_of(true, grow=grow)), QUICK)
-    assert float(found.factor[0]) == pytest.approx(1 / 1.02, abs=0.005)
+    assert found_factor(film(spots()), 1.02, grow=grow) == pytest.approx(1 / 1.02, abs=0.005)
 
 
 @pytest.mark.parametrize("bias", [1.03, 0.975])
 def test_people_whom_the_image_cuts_off_are_found_by_the_rest_of_them(bias):
     true = film([(x, -1.75) for x in (-0.3, 0.0, 0.3, -0.2, 0.1, 0.2)])
-    found = find_depth(inputs_of(moved(true, bias), masks_of(true)), QUICK)
-    assert float(found.factor[0]) == pytest.approx(1 / bias, abs=0.006)
+    assert found_factor(true, bias) == pytest.approx(1 / bias, abs=0.006)
 
 
 def test_few_or_cut_off_or_hidden_people_stay_where_they_are():

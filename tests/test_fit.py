@@ -86,16 +86,15 @@ def test_lasting_offsets_of_a_detector_do_not_change_the_stature(walk):
 
 def test_the_shape_costs_its_proportions_and_the_height_beside_those_of_adults():
     usual, dirs = heights_of(open_body())
-    unknown = priors.stature_of(open_body(), (), torch.arange(2), torch.arange(2))
+    two = torch.arange(2)
+    unknown = priors.stature_of(open_body(), (), two, two)
     taller = (1.78 - usual) * dirs / dirs.square().sum()  # one standard deviation above the mean
     aside = torch.zeros(10)
     aside[[0, 2]] = torch.stack([-dirs[2], dirs[0]]) / dirs[[0, 2]].norm()
     betas = torch.stack([taller, taller + 2 * aside])
     torch.testing.assert_close(priors.shape_cost(unknown, betas), torch.tensor([1.0, 5.0]))
-    known = priors.stature_of(open_body(), (1.78,), torch.arange(2), torch.arange(2))
-    torch.testing.assert_close(
-        priors.shape_cost(known, betas), torch.tensor([0.0, 4.0]), atol=1e-4, rtol=0
-    )
+    cost = priors.shape_cost(priors.stature_of(open_body(), (1.78,), two, two), betas)
+    torch.testing.assert_close(cost, torch.tensor([0.0, 4.0]), atol=1e-4, rtol=0)
 
 
 def test_a_body_that_leans_as_a_whole_falls_and_one_that_stands_does_not(walk):
@@ -122,14 +121,10 @@ def test_offsets_cost_their_squared_deviations_by_the_name_of_the_keypoint():
 
 def random_pose(rows=3, seed=0):
     rng = torch.Generator().manual_seed(seed)
-    base = zero_pose(rows, open_body())
-    return dataclasses.replace(
-        base,
-        betas=torch.randn(rows, 10, generator=rng),
-        global_orient=torch.randn(rows, 3, generator=rng),
-        body_pose=0.5 * torch.randn(rows, 63, generator=rng),
-        transl=torch.randn(rows, 3, generator=rng),
-    )
+    sizes = {"betas": 10, "global_orient": 3, "body_pose": 63, "transl": 3}
+    some = {name: torch.randn(rows, size, generator=rng) for name, size in sizes.items()}
+    some["body_pose"] *= 0.5
+    return dataclasses.replace(zero_pose(rows, open_body()), **some)
 
 
 def test_the_rig_puts_keypoints_and_joints_where_the_whole_body_has_them():
@@ -171,9 +166,7 @@ def test_bodies_are_found_from_keypoints_alone(walk):
     found = fit(seen(walk, noise=3.0, missing=0.1), None)
     aligned, absolute = off(found, walk)
     assert aligned < 0.06
-    assert (
-        absolute < 1.1 * priors.UNKNOWN * 4.0
-    )  # size and distance look the same: of adults, at 4 m
+    assert absolute < 1.1 * priors.UNKNOWN * 4.0  # size and distance look the same: adults at 4 m
     assert found.miss.mean() < 5
     assert found.bodies.pose.betas.unique(dim=0).shape[0] == 1
     verts, joints = open_body().posed(found.bodies.pose)
@@ -234,13 +227,8 @@ def test_legs_of_a_sitter_that_no_row_shows_stay_as_they_were_before_and_after()
 def test_two_people_keep_their_own_shapes_and_places():
     one, two = as_bodies(*walker(5, tall=2.0)), as_bodies(*walker(5, yaw=2.5, tall=-2.0), person=4)
     a, b = seen(one), seen(two)
-    both = dataclasses.replace(
-        a,
-        points=torch.cat([a.points, b.points]),
-        confidence=torch.cat([a.confidence, b.confidence]),
-        frame=torch.cat([a.frame, b.frame]),
-        person=torch.cat([a.person, b.person]),
-    )
+    names = ("points", "confidence", "frame", "person")
+    both = dataclasses.replace(a, **{n: torch.cat([getattr(x, n) for x in (a, b)]) for n in names})
     out = fit(both).bodies
     assert out.person.tolist() == [0] * 5 + [4] * 5
     assert out.pose.betas.unique(dim=0).shape[0] == 2
@@ -381,11 +369,8 @@ def test_the_energy_has_the_gradient_of_finite_differences(walk):
     )
 
     def total(*values):
-        return (
-            FitState(Unknowns(*values, none, none), frame, looked, FitConfig())
-            .energy(Stage())
-            .total
-        )
+        at = Unknowns(*values, none, none)
+        return FitState(at, frame, looked, FitConfig()).energy(Stage()).total
 
     leaves = [v.clone().requires_grad_() for v in base]
     assert torch.autograd.gradcheck(total, leaves, eps=1e-6, rtol=1e-4, atol=1e-2, fast_mode=True)
@@ -501,12 +486,10 @@ def test_the_height_of_numbers_of_the_shape_is_that_of_the_body():
     betas = torch.tensor([[1.5, -1.0, 0.5], [0.0, 2.0, 0.0]])
     y = shaped(open_body(), betas)[0][..., 1]
     tall = y.amax(-1) - y.amin(-1)
-    known = priors.stature_of(
-        open_body(), tuple((tall + 0.02).tolist()), torch.arange(2), torch.arange(2)
-    )
-    torch.testing.assert_close(
-        priors.height_cost(known, betas), torch.full((2,), 4e-4), atol=1e-4, rtol=0.2
-    )
+    two = torch.arange(2)
+    known = priors.stature_of(open_body(), tuple((tall + 0.02).tolist()), two, two)
+    cost = priors.height_cost(known, betas)
+    torch.testing.assert_close(cost, torch.full((2,), 4e-4), atol=1e-4, rtol=0.2)
 
 
 @pytest.mark.slow

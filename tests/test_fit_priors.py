@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from make_keypoints import CAMERA, as_bodies, keypoints_at, seen, walker
+from test_fit import QUICK
 
 from mover.bodies.skeleton import BODY
 from mover.bodies.skinning import growth_of, open_body
@@ -25,11 +26,8 @@ from mover.fitting.tracks import CALM, joint_speed, motion_of, stages_of
 from mover.fitting.unknowns import NO_FLOOR, Frame, Unknowns, floor_of, rig_of
 from mover.geometry.rotations import axis_angle, rot_x, rot_y, rot_z, rotation_vectors
 
-QUICK = FitConfig(
-    start_steps=20,
-    stages=(dataclasses.replace(STAGES[0], steps=25), dataclasses.replace(STAGES[1], steps=50)),
-)
 REST = resting(1, torch.zeros(1))
+UP = torch.tensor([0.0, -1.0, 0.0])
 
 
 @pytest.mark.parametrize("fps", [5.0, 30.0])
@@ -132,30 +130,26 @@ def lying_down(depths, rises):
     return joints
 
 
+def expected_distances(joints):
+    rows = torch.arange(len(joints))
+    return ground.distances_of_lying_people(joints, UP, [rows], rows / 5)
+
+
 def test_a_person_lying_along_the_view_is_expected_where_they_sat_before_and_after():
     upright = [1.5] * 4
     joints = lying_down([4.0] * 4 + [4.9] * 5 + [4.4] * 4, upright + [0.0] * 5 + upright)
-    time = torch.arange(13) / 5
-    track = [torch.arange(13)]
-    found = ground.distances_of_lying_people(joints, torch.tensor([0.0, -1, 0]), track, time)
+    found = expected_distances(joints)
     assert found[:4].isnan().all()
     assert found[9:].isnan().all()
     between = torch.linspace(math.log(4.0), math.log(4.4), 7)[1:-1]
     torch.testing.assert_close(found[4:9], between)
-    alone = ground.distances_of_lying_people(
-        joints[4:9], torch.tensor([0.0, -1, 0]), [torch.arange(5)], time[4:9]
-    )
-    assert alone.isnan().all()  # it is not known where they came from
+    assert expected_distances(joints[4:9]).isnan().all()  # it is not known where they came from
 
 
 def test_a_body_across_the_view_shows_its_distance_itself():
     joints = lying_down([4.0, 4.9, 4.0], [1.5, 0.0, 1.5])
     joints[1, BODY.index("neck")] = torch.tensor([0.5, 0.0, 4.9])
-    track = [torch.arange(3)]
-    found = ground.distances_of_lying_people(
-        joints, torch.tensor([0.0, -1, 0]), track, torch.arange(3) / 5
-    )
-    assert found.isnan().all()
+    assert expected_distances(joints).isnan().all()
 
 
 def test_a_leaning_floor_lies_where_its_soles_are():
@@ -199,7 +193,6 @@ def test_only_lying_people_have_arms_anywhere_in_their_ranges():
 
 # Which way the head is, and what lying people are rolled to.
 
-UP = torch.tensor([0.0, -1.0, 0.0])
 STARTED = FitConfig(stages=(dataclasses.replace(STAGES[1], steps=10),))
 """Little more than the hypotheses, which decide."""
 
@@ -241,10 +234,7 @@ def test_of_a_stretch_of_lying_the_way_of_the_most_counts():
     assert against[6:8, 2].all()  # lying the other way after having stood
     assert not against[6:8, 1].any()
     assert not against[[0, 5, 8]].any()
-
-
-def test_where_no_person_lies_nothing_is_against_anything():
-    trunks = torch.stack([UP, torch.tensor([0.0, -0.7, 0.7])]).expand(4, 2, 3)
+    trunks = torch.stack([UP, torch.tensor([0.0, -0.7, 0.7])]).expand(4, 2, 3)  # no person lies
     assert not turned_round(trunks, torch.tensor([0, 1, 1, 0]), UP).any()
 
 
@@ -333,12 +323,8 @@ def test_poses_follow_the_noise_of_keypoints_less():
         stages=tuple(dataclasses.replace(s, steps=60) for s in STAGES[:2]),
     )  # fmt: skip
     inputs = FitInputs(seen(walk, noise=8.0), CAMERA, open_body())
-    off = []
+    off, true = list[float](), walk.joints[:, :22]
     for config in (quick, dataclasses.replace(quick, left=0.0)):
         found = fit_bodies(inputs, config).bodies.joints[:, :22]
-        off.append(
-            float(
-                (procrustes(found, walk.joints[:, :22]) - walk.joints[:, :22]).norm(dim=-1).mean()
-            )
-        )
+        off.append(float((procrustes(found, true) - true).norm(dim=-1).mean()))
     assert off[0] < 0.95 * off[1]

@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import tiny_capture as tiny
 import torch
@@ -33,16 +34,11 @@ def capture(tmp_path: Path) -> Capture:
 
 def elsewhere(piece: SceneObject, step: float) -> SceneObject:
     """Another shape in another place."""
-    import numpy as np
-
     return replace(
-        piece,
-        mesh=make_piece("cabinet", np.random.default_rng(0)).mesh,
-        mesh_file="",
+        piece, mesh=make_piece("cabinet", np.random.default_rng(0)).mesh, mesh_file="",
         t_world_object=piece.t_world_object + torch.tensor([step, 0.0, -step]),
-        yaw=piece.yaw + step,
-        scale=torch.tensor([1.1, 0.8, 1.3]),
-    )
+        yaw=piece.yaw + step, scale=torch.tensor([1.1, 0.8, 1.3]),
+    )  # fmt: skip
 
 
 def with_others(capture: Capture) -> Capture:

@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from analytic import FACES, box_verts
 from figures import ARMS_DOWN, ARMS_UP, SEATED, STRIDE, people, pose, turned
 
 from mover.bodies.parts import members, parts_of
@@ -31,6 +32,13 @@ def unknown(base, seed=0):
     return hidden, replace(true, part_of=true.part_of[order])
 
 
+def upright(detail):
+    """The open body in its T-pose, its pelvis at the origin."""
+    model = open_body(detail)
+    verts = model.posed(zero_pose(1, model))[0]
+    return replace(people(zero_pose(1, model)), verts=verts, faces=model.faces)
+
+
 def overlap(a, b) -> float:
     return float((a & b).sum() / (a | b).sum())
 
@@ -41,9 +49,7 @@ def centres(bodies, parts):
 
 @pytest.mark.parametrize("detail", ["small", "full"])
 def test_every_part_is_there_and_left_mirrors_right(detail):
-    model = open_body(detail)
-    verts = model.posed(zero_pose(1, model))[0]
-    bodies = replace(people(zero_pose(1, model)), verts=verts, faces=model.faces)
+    bodies = upright(detail)
     parts = parts_of(bodies)
     middle = centres(bodies, parts)
     for name in PARTS:
@@ -73,10 +79,7 @@ def test_parts_face_where_they_should():
 def test_seat_from_skinning_weights_is_where_the_artists_put_the_buttocks(name):
     with np.load(ASSETS / name) as data:
         true = torch.from_numpy(data["buttocks"])
-    model = open_body("small" if "small" in name else "full")
-    verts = model.posed(zero_pose(1, model))[0]
-    parts = parts_of(replace(people(zero_pose(1, model)), verts=verts, faces=model.faces))
-    seat = members(parts, "seat")
+    seat = members(parts_of(upright("small" if "small" in name else "full")), "seat")
     assert (seat & true).sum() / seat.sum() > 0.8
     assert overlap(seat, true) > 0.55
 
@@ -88,9 +91,8 @@ def test_seat_is_what_a_sitter_sits_on():
     trunk = torch.isin(model.weights.argmax(1), torch.tensor(upper))
     height = torch.where(trunk, bodies.verts[0, :, 1], torch.inf)
     lowest = height.topk(40, largest=False).indices
-    assert (
-        members(parts_of(bodies), "seat", "left_thigh", "right_thigh")[lowest].float().mean() > 0.9
-    )
+    carried = members(parts_of(bodies), "seat", "left_thigh", "right_thigh")
+    assert carried[lowest].float().mean() > 0.9
 
 
 @pytest.mark.parametrize("name", POSTURES)
@@ -106,17 +108,12 @@ def test_parts_of_an_unknown_mesh_are_those_of_the_body_it_is(name):
 
 
 def test_of_a_statue_on_a_block_only_the_lowest_faces_are_soles(caplog):
-    corners = torch.tensor([[x, y, z] for x in (0, 1.0) for y in (0, 1.0) for z in (0, 1.0)])
-    faces = torch.tensor([
-        [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-        [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
-    ])  # fmt: skip
-    stretched = corners * torch.tensor([1.0, 0.1, 1.0])
-    block = replace(people(pose({})), verts=stretched[None], faces=faces, pose=None)
+    corners = box_verts((1.0, 0.1, 1.0)).float()
+    block = replace(people(pose({})), verts=corners[None], faces=FACES, pose=None)
     found = parts_of(block)
     assert "unknown topology and no joints" in caplog.text
     assert found.rings.numel() == 0
-    assert (found.part_of[stretched[:, 1] > 0] == -1).all()
+    assert (found.part_of[corners[:, 1] > 0] == -1).all()
 
 
 @pytest.mark.skipif(not SHARED.exists(), reason="the shared data are not here")

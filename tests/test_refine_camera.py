@@ -1,3 +1,4 @@
+import functools
 from dataclasses import replace
 
 import torch
@@ -18,30 +19,29 @@ LOOSE = torch.diag(torch.tensor([0.07, 0.07, 0.1]).square())
 TIGHT = torch.diag(torch.tensor([1e-4, 1e-4, 1e-4]).square())
 
 
-def wrong_camera(covariance):
-    """The analytic room seen through a camera that is 1.5 degrees and 3 cm off."""
-    inputs = make_inputs(size=64)
+@functools.cache
+def wrong_camera():
+    """The analytic room seen through a camera that is 1.5 degrees and 3 cm off, and the true one.
+
+    As in the pipeline objects are placed first, under the wrong camera.
+    """
+    inputs = make_inputs(size=32)
     pitch, roll = pitch_roll(inputs.camera.R_cam_world)
     wrong = tilted(pitch + 0.026, roll - 0.02)
-    objects, truth = inputs.objects, inputs.starts
-    ground = GROUND + 0.03
-    start = reproject(truth, objects.size[:, 1], inputs.camera.R_cam_world, wrong)
+    objects, ground = inputs.objects, GROUND + 0.03
+    start = reproject(inputs.starts, objects.size[:, 1], inputs.camera.R_cam_world, wrong)
     start = rest_on_support(start, objects.supports, objects.size[:, 1], ground)
-    start = replace(
-        start,
-        t_world_object=start.t_world_object[0],
-        yaw=start.yaw[0],
-        log_scale=start.log_scale[0],
-    )
     camera = replace(inputs.camera, R_cam_world=wrong)
     fitted = place_objects(
-        PlaceInputs(objects, camera, ground, inputs.image, HumanCues(), start[None], start.yaw),
+        PlaceInputs(objects, camera, ground, inputs.image, HumanCues(), start, start.yaw[0]),
         replace(ROBUST.layout, yaws=1, short=Adam(0)),
-    )  # as in the pipeline: first the objects, under the wrong camera
-    layout = fitted.layout
-    at = torch.stack([*pitch_roll(camera.R_cam_world), torch.tensor(ground)])
-    feet = Gaussian(at, torch.linalg.inv(covariance))
-    return inputs.camera, RefineInputs(camera, ground, feet, objects, inputs.image, layout)
+    )
+    feet = torch.stack([*pitch_roll(camera.R_cam_world), torch.tensor(ground)])
+    found = RefineInputs(
+        camera, ground, Gaussian(feet, torch.linalg.inv(LOOSE)), objects, inputs.image,
+        fitted.layout,
+    )  # fmt: skip
+    return inputs.camera, found
 
 
 def errors(camera, truth):
@@ -50,7 +50,7 @@ def errors(camera, truth):
 
 
 def test_exact_objects_find_the_camera_that_the_feet_missed():
-    truth, inputs = wrong_camera(LOOSE)
+    truth, inputs = wrong_camera()
     found = refine_camera(inputs, RefineConfig(rounds=1))
     before, after = errors(inputs.camera, truth), errors(found.camera, truth)
     assert after[0] < 0.3 * before[0]
@@ -58,14 +58,15 @@ def test_exact_objects_find_the_camera_that_the_feet_missed():
 
 
 def test_feet_that_are_certain_are_trusted():
-    _, inputs = wrong_camera(TIGHT)
+    _, inputs = wrong_camera()
+    inputs = replace(inputs, feet=replace(inputs.feet, precision=torch.linalg.inv(TIGHT)))
     found = refine_camera(inputs, RefineConfig(rounds=1))
     assert max(errors(found.camera, inputs.camera)) < 1e-3
     assert abs(found.ground - inputs.ground) < 1e-3
 
 
 def test_without_any_object_on_the_floor_nothing_changes():
-    _, inputs = wrong_camera(LOOSE)
+    _, inputs = wrong_camera()
     free = replace(inputs.objects, supports=torch.full((3,), -2))
     found = refine_camera(replace(inputs, objects=free), RefineConfig(rounds=1))
     assert found.ground == inputs.ground

@@ -17,16 +17,10 @@ def bodies_of(joints, frame, fps: float | None = 30.0, person=None, names=("pelv
     joints = torch.as_tensor(np.asarray(joints), dtype=torch.float32)
     n = len(joints)
     return Bodies(
-        verts=joints[:, :3],
-        faces=torch.tensor([[0, 1, 2]]),
-        joints=joints if names else None,
-        joint_names=names,
-        frame=torch.as_tensor(frame),
-        person=torch.zeros(n, dtype=torch.long) if person is None else torch.as_tensor(person),
-        fps=fps,
-        space="camera",
-        pose=None,
-    )
+        joints[:, :3], torch.tensor([[0, 1, 2]]), joints if names else None, names,
+        torch.as_tensor(frame), torch.as_tensor(np.zeros(n, int) if person is None else person),
+        fps, "camera", None,
+    )  # fmt: skip
 
 
 def kept(bodies, **config):
