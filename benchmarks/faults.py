@@ -180,6 +180,12 @@ FAULTS: dict[str, tuple[str, Change]] = {
     "bodies at 25 for 30 a second": ("frames a second", frames(lambda f: (f / 1.2).round().long())),
     "tracks 1000, 1001, ...": ("different tracks", tracks(lambda p, _: p + 1000)),
     "tracks swapped": ("different tracks", tracks(lambda p, _: p.max() - p, 2)),
+    "tracks swapped to and fro": (
+        "exchange tracks", tracks(lambda p, f: p.where(f // 9 % 2 == 0, p.max() - p), 2),
+    ),
+    "bodies from frame 1000": ("frames 1000 to", frames(lambda f: f + 1000)),
+    "bodies in milliseconds": ("of the same time", frames(lambda f: 40 * f + 7)),
+    "bodies at 50 for 30 a second": ("times too many", frames(lambda f: (f * 5 / 3).long())),
     "tracks of masks in pieces": ("different tracks", tracks(lambda p, f: 10 * p + f // 40 + 3)),
     "annotations exchanged": ("exchanged", exchanged),
     "masks of people inverted": ("inverted", people_inverted),

@@ -99,6 +99,11 @@ def test_parts_of_different_pictures_and_nothing_to_compare_are_said(right):
         replace(right, detections=elsewhere, bodies=None, people=None)
     ).warnings
     assert "one room" in said
+    first, *rest = right.detections
+    (said,) = check_against_picture(
+        replace(right, detections=(replace(first, box=boxes[0], mask=None), *rest))
+    ).warnings
+    assert f"{right.scene.objects[0].id} not where the annotation is" in said
     bare = replace(right, detections=(), people=None)
     (said,) = check_against_picture(bare).warnings
     assert "nothing could be held against the picture" in said

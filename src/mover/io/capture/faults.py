@@ -34,16 +34,22 @@ from mover.io.capture.agreement import (
     thinned_capture,
 )
 from mover.io.capture.folder import write_capture
+from mover.io.files.fields import listed
 
 MARGIN = 0.06  # a fault is named from this gain on: unharmed known rooms have none above 0.01
 FITTED_MARGIN = 0.12  # the same where numbers are fitted, which fit noise, too
 TIME_MARGIN = 0.02  # of times, which are sharp: unharmed rooms lose .03 by a frame
+SAME = 0.01  # by so much better is a fault of frames one by one than a simpler one
 MOST_FAULTS = 3  # that are found one after the other
 MOST_SHIFT = 120  # frames
-RATES = (1.2, 1.25, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 10.0)  # between usual frame rates
+USUAL = (5, 6, 10, 12, 15, 20, 24, 25, 30, 50, 60, 120)  # frames a second
+RATES = tuple(sorted({a / b for a in USUAL for b in USUAL if b < a <= 12 * b}))
 UNITS = {"feet": 3.2808, "decimetres": 10.0, "inches": 39.37, "centimetres": 100.0,
          "millimetres": 1000.0, "kilometres": 0.001, "tens of metres": 0.1}  # fmt: skip
 POOR = 0.2  # mean overlap below which parts of a capture are of different pictures
+POOR_OBJECTS = 0.4  # the same of objects: initial scenes of known and real rooms have .46 and more
+MISSED = 0.1  # overlap below which an object is not at its annotation: those have .23 and more
+FITS = 0.45  # mean overlap that another lens must reach: other pictures reach .34
 FEWEST = 3  # outlines that show a lens, rows that show a time
 SCALES = 1.03 ** torch.arange(-55.0, 56.0)  # between lenses, or sizes
 
@@ -102,7 +108,7 @@ def check_against_picture(capture: Capture) -> Findings:
             break
         fault, thin, found = best
         faults.append(fault)
-    return Findings(own, tuple(faults), tuple(_unexplained(found)))
+    return Findings(own, tuple(faults), tuple(_unexplained(thin, found)))
 
 
 def write_mended(capture: Capture, findings: Findings, source: Path, folder: Path) -> None:
@@ -133,14 +139,19 @@ def _gain(own: Agreement, other: Agreement) -> float:
     return -1.0 if after < before / 2 else sum(mean(b) - mean(a) for a, b in pairs)
 
 
-def _unexplained(found: Agreement) -> Iterator[str]:
+def _unexplained(thin: Capture, found: Agreement) -> Iterator[str]:
     """What fits nothing, and that nothing could be compared."""
     rows, both = int((~found.people.isnan()).sum()), "(mean overlap in the picture {:.2f})"
     if not len(found.objects) and not rows:
         yield "nothing could be held against the picture: no object or body has a box or a mask"
-    if len(found.objects) > 1 and mean(found.objects) < POOR:
+    known = {one.id for one in thin.detections}
+    named = [one.id for one in thin.scene.objects if one.annotation in known]
+    away = [name for name, one in zip(named, found.objects, strict=False) if float(one) < MISSED]
+    if len(found.objects) > 1 and mean(found.objects) < POOR_OBJECTS:
         missed = f"scene.json: the objects miss their annotations {both}".format
         yield f"{missed(mean(found.objects))}; are scene, camera and picture of one room?"
+    elif away:
+        yield f"scene.json: {listed('object', away)} not where the annotation is; is it its own?"
     if rows >= FEWEST and mean(found.people) < POOR:
         missed = f"bodies.npz: the bodies miss their masks {both}".format
         yield f"{missed(mean(found.people))}; are bodies, masks and camera of one video?"
@@ -150,8 +161,8 @@ def _unexplained(found: Agreement) -> Iterator[str]:
 
 
 WORLDS = {
-    "lying on its side (+z is up)": ("x z -y", 1, "turn it so that +y is up (import: --up z)"),
-    "upside down (+y is down)": ("x -y -z", -1, "turn it so that +y is up (import: --up=-y)"),
+    "on the side (+z is up)": ("x z -y", 1, "+y must be up (import: --up z)"),
+    "upside down (+y is down)": ("x -y -z", -1, "+y must be up (import: --up=-y)"),
     "upside down (only y is turned)": ("x -y z", 1, "change the sign of y"),
     "behind the camera (+z is forward)": ("x y -z", -1, "the camera looks along -z"),
     "turned round (+z is forward)": ("-x y -z", 1, "the camera looks along -z"),
@@ -194,7 +205,7 @@ def hypotheses(capture: Capture, found: Agreement) -> Iterator[Fault]:
     yield Fault("bodies.npz: the bodies are in the world", "'space' is world", mends.from_world)
     tracks = "people.json: masks and bodies of one person have different tracks"
     yield Fault(tracks, "give both the same", mends.same_tracks)
-    for fitted in (_times, _annotations, _lenses):
+    for fitted in (_times, _swaps, _annotations, _lenses):
         yield from fitted(capture, found)
 
 
@@ -231,8 +242,14 @@ def _times(capture: Capture, found: Agreement) -> Iterator[Fault]:
             f"the bodies are {count} early": (1, n),
         }
     for rate in RATES:
-        changes[f"the bodies have {rate:g} times too few frames a second"] = (rate, 0)
-        changes[f"the bodies have {rate:g} times too many frames a second"] = (1 / rate, 0)
+        changes[f"the bodies have {rate:.3g} times too few frames a second"] = (rate, 0)
+        changes[f"the bodies have {rate:.3g} times too many frames a second"] = (1 / rate, 0)
+    (start, end), (first, last) = (x.frame.aminmax() for x in (bodies, people))
+    if start != first:
+        rate = 1.0 if end == start else float((last - first) / (end - start))
+        name = f"the bodies have the frames {start} to {end}, the masks {first} to {last}"
+        for k in (1.0, rate):
+            changes[name + (k != 1) * " of the same time"] = (k, round(float(first - k * start)))
     frames = torch.stack([mends.frames(bodies.frame, *change) for change in changes.values()])
     rows = partners(frames, bodies.person.expand_as(frames), people)
     masks = mask_boxes(people.masks)[rows]
@@ -243,6 +260,18 @@ def _times(capture: Capture, found: Agreement) -> Iterator[Fault]:
     name = list(changes)[int(fits.argmax())]
     cure = "number the frames of bodies and masks as those of one video (--fps), from 0"
     yield Fault(f"bodies.npz: {name}", cure, partial(mends.retimed, *changes[name]), TIME_MARGIN)
+
+
+def _swaps(capture: Capture, found: Agreement) -> Iterator[Fault]:
+    """People who exchange their tracks in some frames."""
+    del found
+    other = mends.by_masks(capture)
+    if capture.bodies is None or other.bodies is None or other is capture:
+        return
+    frame = capture.bodies.frame[capture.bodies.person != other.bodies.person].unique().tolist()
+    name = f"bodies.npz, people.json: people exchange tracks, as in {listed('frame', frame)}"
+    cure = "give each person one number; mended, bodies have those of the masks they lie on"
+    yield Fault(name, cure, mends.by_masks, MARGIN + SAME)
 
 
 def _views(capture: Capture) -> tuple[list[int], Float[Tensor, "n 4"], Float[Tensor, "n 4"]]:
@@ -277,7 +306,7 @@ def _lenses(capture: Capture, found: Agreement) -> Iterator[Fault]:
     """Outlines fit boxes that are scaled and moved: another lens, another size, a crop."""
     camera, bodies, people = capture.scene.camera, capture.bodies, capture.people
     _, ours, theirs = _views(capture)
-    k, _ = _fitted(ours, theirs, camera, (ours[:, :2] + ours[:, 2:]) / 2)
+    k, _, _ = _fitted(ours, theirs, camera, (ours[:, :2] + ours[:, 2:]) / 2)
     what = f"{1 / k:.2g} times too large" if k < 1 else f"{k:.2g} times too small"
     mend, cure = partial(mends.each, mends.scaled(k, 1)), f"multiply 'scale' by {k:.2g}"
     yield Fault(f"scene.json: sizes are {what} for the positions", cure, mend, FITTED_MARGIN)
@@ -290,7 +319,9 @@ def _lenses(capture: Capture, found: Agreement) -> Iterator[Fault]:
         ("camera.json", "the scene", ours, theirs),
         ("bodies.npz", "the bodies", seen, masks),
     ):
-        scale, move = _fitted(some, others, camera, camera.K[:2, 2])
+        scale, move, shared = _fitted(some, others, camera, camera.K[:2, 2])
+        if shared < FITS:
+            continue
         K = camera.K * torch.tensor([[scale], [scale], [1.0]])
         K[:2, 2] = camera.K[:2, 2] + move
         mend = partial(mends.seen_by, replace(camera, K=K))
@@ -304,15 +335,15 @@ def _lenses(capture: Capture, found: Agreement) -> Iterator[Fault]:
 def _fitted(
     ours: Float[Tensor, "n 4"], theirs: Float[Tensor, "n 4"], camera: Camera,
     pivot: Float[Tensor, "*n 2"],
-) -> tuple[float, Float[Tensor, "2"]]:  # fmt: skip
-    """Scale about points and shift in the picture [px] with which boxes lie on others best."""
+) -> tuple[float, Float[Tensor, "2"], float]:  # fmt: skip
+    """Scale about points and shift in the picture [px] with which boxes share most; the share."""
     if len(ours) < FEWEST:
-        return 1.0, torch.zeros(2)
+        return 1.0, torch.zeros(2), 0.0
     pivot = torch.cat([pivot, pivot], -1)
     grown = pivot + SCALES[:, None, None] * (ours - pivot)
     apart = theirs - in_image(grown, camera)
     moves = ((apart[..., :2] + apart[..., 2:]) / 2).median(1).values
     moves = torch.cat([torch.zeros_like(moves), moves])
     boxes = in_image(torch.cat([grown, grown]) + moves.repeat(1, 2)[:, None], camera)
-    best = int(iou2d(boxes, theirs.expand_as(boxes)).mean(1).argmax())
-    return float(SCALES[best % len(SCALES)]), moves[best]
+    shared, best = iou2d(boxes, theirs.expand_as(boxes)).mean(1).max(0)
+    return float(SCALES[int(best) % len(SCALES)]), moves[best], float(shared)

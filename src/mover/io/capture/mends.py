@@ -14,8 +14,10 @@ from torch import Tensor
 from mover.core.types import Camera, Capture, Detection, Masks, SceneObject, Segment
 from mover.geometry.camera import pitch_roll, tilted
 from mover.geometry.rle import area, mask_boxes, run_lengths
+from mover.io.capture.agreement import assigned, box_around, in_image, pairwise_iou2d
 from mover.io.capture.tracks import pair_tracks, paired
 
+LEAST = 0.2  # overlap of a body and the mask that it lies on
 Mend = Callable[[Capture], Capture]
 Change = Callable[[SceneObject], SceneObject]
 Matrix = Float[Tensor, "3 3"]
@@ -168,3 +170,22 @@ def same_tracks(capture: Capture) -> Capture:
     pairs = pair_tracks(bodies, seen, capture.scene.camera)
     bodies, seen = paired(bodies, seen, pairs)
     return replace(capture, bodies=bodies, people=seen) if pairs.notes else capture
+
+
+def by_masks(capture: Capture) -> Capture:
+    """Bodies with the tracks of the masks that they lie on, where only those exchange places."""
+    bodies, seen, camera = capture.bodies, capture.people, capture.scene.camera
+    if bodies is None or seen is None:
+        return capture
+    person = bodies.person.clone()
+    ours, theirs = in_image(box_around(bodies.verts, camera), camera), mask_boxes(seen.masks)
+    for frame in bodies.frame.unique().tolist():
+        a, b = ((one.frame == frame).nonzero()[:, 0] for one in (bodies, seen))
+        if min(len(a), len(b)) < 2:
+            continue
+        pairs = assigned(pairwise_iou2d(ours[a].to(theirs), theirs[b]), LEAST)
+        i, j = torch.tensor(pairs, dtype=torch.long).reshape(-1, 2).T
+        if {*person[a[i]].tolist()} == {*seen.person[b[j]].tolist()}:
+            person[a[i]] = seen.person[b[j]].to(person)
+    same = bool((person == bodies.person).all())
+    return capture if same else replace(capture, bodies=replace(bodies, person=person))
