@@ -15,14 +15,7 @@ from mover.geometry.boxes import iou2d
 from mover.geometry.rle import area, joined, mask_boxes
 from mover.io.files.fields import At, Warn, listed, plain, shown, unique
 from mover.io.files.schema import Box, FrameRate, Id, Index, Share, checked
-from mover.io.masks.coco import (
-    annotations_tree,
-    categories_of,
-    category_of,
-    check_image,
-    mask_of,
-    segmentation,
-)
+from mover.io.masks import coco
 
 LEAST_OVERLAP = 0.3  # of a box and the box of its mask; below, they are not of one thing
 
@@ -38,18 +31,20 @@ class AnnotationFields(Struct, frozen=True):
 
 def detections_of(at: At, camera: Camera, warn: Warn) -> tuple[Detection, ...]:
     """The instances of objects.json."""
-    image = check_image(_only_image(at), camera)
-    names = categories_of(at.get("categories"))
+    image = coco.check_image(_only_image(at), camera)
+    names = coco.categories_of(at.get("categories"))
     known, found = set[object](), list[Detection]()
     for item in at.get("annotations").items():
         row = checked(item, AnnotationFields)
         if row.image_id != image:
             item.get("image_id").refuse(f"{image}, the id of the one image")
         box = _box_of(item.get("bbox"), row.bbox, camera, warn)
-        mask = mask_of(item, camera, warn)
-        if mask is not None:
-            _check_mask(item, mask, box, warn)
-        category = category_of(item.get("category_id"), names)
+        mask = coco.mask_of(item, camera, warn)
+        if mask is not None and not area(mask, 0):
+            item.get("segmentation").refuse("a mask with pixels", "an empty mask")
+        if mask is not None and iou2d(box, mask_boxes(mask)[0]) < LEAST_OVERLAP:
+            warn(f"{item.place} has a box and a mask in different places")
+        category = coco.category_of(item.get("category_id"), names)
         score = 1.0 if row.score is None else row.score
         found.append(Detection(row.id, category, box, mask, score))
         unique(item.get("id"), known, row.id, "an id")
@@ -89,14 +84,6 @@ def _box_of(at: At, box: Box, camera: Camera, warn: Warn) -> Float[Tensor, "4"]:
     return torch.tensor([x, y, x + w, y + h])
 
 
-def _check_mask(at: At, mask: Masks, box: Float[Tensor, "4"], warn: Warn) -> None:
-    """Refuse an empty mask, warn of one that is elsewhere than its box."""
-    if not area(mask, 0):
-        at.get("segmentation").refuse("a mask with pixels", "an empty mask")
-    if iou2d(box, mask_boxes(mask)[0]) < LEAST_OVERLAP:
-        warn(f"{at.place} has a box and a mask in different places")
-
-
 def detections_to_json(
     detections: tuple[Detection, ...], camera: Camera, file_name: str | None
 ) -> dict[str, Any]:
@@ -107,10 +94,10 @@ def detections_to_json(
         x, y, right, bottom = plain(d.box)
         row = {"id": d.id, "image_id": 0, "category_id": d.category,
                "bbox": [x, y, right - x, bottom - y], "score": d.score}  # fmt: skip
-        mask = {} if d.mask is None else {"segmentation": segmentation(d.mask, 0)}
+        mask = {} if d.mask is None else {"segmentation": coco.segmentation(d.mask, 0)}
         annotations.append({**row, **mask})
     image |= {} if file_name is None else {"file_name": file_name}
-    return annotations_tree(annotations, image, first=1)
+    return coco.annotations_tree(annotations, image, first=1)
 
 
 # people.json and furniture.json: visible masks of people, and of objects, in the frames.
@@ -155,21 +142,18 @@ def people_of(at: At, camera: Camera, warn: Warn) -> PeopleFile:
             field = At(value, at.file, f"info.heights.{key}")
             field.refuse("the number of a track as its name", f"the name {shown(key)}")
         heights[str(int(key))] = value
-    frames: dict[int, None] = {}
+    frames = set[int]()
     for item in at.get("images").items():
-        frame = check_image(item, camera)
-        if frame in frames:
-            item.get("id").refuse("a frame that is not used twice")
-        frames[frame] = None
-    given, hidden = at.maybe("categories"), at.maybe("reference_people")
-    names = None if given is None else categories_of(given)
-    pairs, known_pairs = list[tuple[int, int]](), set[object]()
+        unique(item.get("id"), frames, coco.check_image(item, camera), "a frame")
+    given, behind = at.maybe("categories"), at.maybe("reference_people")
+    names = None if given is None else coco.categories_of(given)
+    pairs, used = list[tuple[int, int]](), set[object]()
     for item in at.get("annotations").items():
         row = checked(item, PersonFields)
         if row.image_id not in frames:
             item.get("image_id").refuse("the id of one of the images")
         pairs.append((row.image_id, row.track_id))
-        unique(item.get("track_id"), known_pairs, pairs[-1], "a track of this frame")
+        unique(item.get("track_id"), used, pairs[-1], "a track of this frame")
     masks = _masks_of(at.get("annotations"), camera, names, warn)
     rows = [(*pair, mask) for pair, mask in zip(pairs, masks, strict=True) if mask is not None]
     if missing := len(pairs) - len(rows):
@@ -178,13 +162,12 @@ def people_of(at: At, camera: Camera, warn: Warn) -> PeopleFile:
     if rows:
         frame, person = torch.tensor([row[:2] for row in rows]).unbind(1)
         people = People(joined([row[2] for row in rows]), frame, person, heights)
-    found = [] if hidden is None else _masks_of(hidden, camera, names, warn)
+    found = [] if behind is None else _masks_of(behind, camera, names, warn)
     reference = [mask for mask in found if mask is not None]
     if lost := len(found) - len(reference):
         warn(f"{at.file}: {lost} people of the reference image without mask")
-    return PeopleFile(
-        people, joined(reference) if reference else None, known.fps, frozenset(frames)
-    )
+    hidden = joined(reference) if reference else None
+    return PeopleFile(people, hidden, known.fps, frozenset(frames))
 
 
 def _masks_of(
@@ -195,10 +178,10 @@ def _masks_of(
     for item in at.items():
         category, box = item.maybe("category_id"), item.maybe("bbox")
         if category is not None and names is not None:
-            category_of(category, names)
+            coco.category_of(category, names)
         if box is not None:
             checked(box, Box)
-        mask = mask_of(item, camera, warn)
+        mask = coco.mask_of(item, camera, warn)
         masks.append(mask if mask is not None and area(mask, 0) else None)
     return masks
 
@@ -213,10 +196,9 @@ def furniture_of(
     """
     found = people_of(at, camera, warn).people
     known = {detection.id for detection in detections}
-    for index, item in enumerate(at.get("annotations").items()):
+    for item in at.get("annotations").items():
         if item.get("track_id").value not in known:
-            field = At(item.get("track_id").value, at.file, f"annotations[{index}].track_id")
-            field.refuse("the id of an annotation in objects.json")
+            item.get("track_id").refuse("the id of an annotation in objects.json")
     if found is None:
         warn(f"{at.file}: there are no masks of objects, expected some in its annotations")
     return found
@@ -241,10 +223,12 @@ def people_to_json(
         pairs = zip(people.frame.tolist(), people.person.tolist(), strict=True)
         for i, (frame, person) in enumerate(pairs):
             row = {"id": i, "image_id": frame, "category_id": 1, "track_id": person}
-            rows.append({**row, "segmentation": segmentation(people.masks, i)})
+            rows.append({**row, "segmentation": coco.segmentation(people.masks, i)})
     tree: dict[str, Any] = {"info": info, "images": [{"id": frame} for frame in sorted(shown_in)]}
     tree |= {"categories": [{"id": 1, "name": "person"}], "annotations": rows}
     if reference is not None:
         hidden = range(len(reference.counts))
-        tree["reference_people"] = [{"segmentation": segmentation(reference, i)} for i in hidden]
+        tree["reference_people"] = [
+            {"segmentation": coco.segmentation(reference, i)} for i in hidden
+        ]
     return tree

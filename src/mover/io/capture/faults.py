@@ -202,7 +202,8 @@ def hypotheses(capture: Capture, found: Agreement) -> Iterator[Fault]:
         cure = "the camera's axes are x right, y down, z forward"
         mend = partial(mends.people, mends.axes(axes))
         yield Fault(f"bodies.npz: the bodies are {name} in the picture", cure, mend)
-    yield Fault("bodies.npz: the bodies are in the world", "'space' is world", mends.from_world)
+    into_camera = partial(mends.people, capture.scene.camera.R_cam_world)
+    yield Fault("bodies.npz: the bodies are in the world", "'space' is world", into_camera)
     tracks = "people.json: masks and bodies of one person have different tracks"
     yield Fault(tracks, "give both the same", mends.same_tracks)
     for fitted in (_times, _swaps, _annotations, _lenses):

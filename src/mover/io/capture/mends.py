@@ -115,11 +115,6 @@ def people(A: Matrix, capture: Capture) -> Capture:
     return replace(capture, bodies=moved)
 
 
-def from_world(capture: Capture) -> Capture:
-    """Bodies that were in the world."""
-    return people(capture.scene.camera.R_cam_world, capture)
-
-
 def frames(frame: Int[Tensor, " rows"], rate: float, shift: int) -> Int[Tensor, " rows"]:
     """Frames counted otherwise."""
     return (frame * rate).round().long() + shift
