@@ -50,8 +50,7 @@ COLUMNS = {
 def judge_clips(args: ExperimentArgs, observe: Observer = silent) -> Path:
     """Make and measure the rooms of all clips below `args.source`; what is finished is kept.
 
-    Returns:
-        The summary, OUT/clips/summary.md; the numbers are the .json beside it.
+    The summary is OUT/clips/summary.md; the numbers are the .json beside it.
 
     Raises:
         InputError: If there is no clip.

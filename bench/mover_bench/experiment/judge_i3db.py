@@ -37,8 +37,7 @@ SAME_KIND = {"stool": "chair"}
 def judge_i3db(args: ExperimentArgs, observe: Observer = silent) -> Path:
     """Measure the scenes below `args.source` with the preset that `args.variants` names first.
 
-    Returns:
-        The summary, OUT/i3db/summary.md; the numbers are the .json beside it.
+    The summary is OUT/i3db/summary.md; the numbers are the .json beside it.
 
     Raises:
         InputError: If there is no source, no scene in it, or no such preset.

@@ -85,10 +85,9 @@ class Judge:
 def measure_moves(truth: Scene, found: Scene, fps: float | None = None) -> dict[str, Any]:
     """Whether objects that are moved stand where they should when, and move when they should.
 
-    Returns:
-        `objects` that are truly moved: IoU3D in each true stay, how far the nearest change is from
-        each true one [s; frames without `fps`] (None: none is), mean IoU3D while a person moves
-        it; and how many others are moved by mistake (`false`).
+    Of `objects` that are truly moved: IoU3D in each true stay, how far the nearest change is from
+    each true one [s; frames without `fps`] (None: none is), mean IoU3D while a person moves it;
+    `false`: how many others are moved by mistake.
     """
     pieces = {piece.id: piece for piece in found.objects}
     rows: list[dict[str, Any]] = []

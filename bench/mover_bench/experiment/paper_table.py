@@ -49,10 +49,7 @@ Jobs = Mapping[TableRow, Sequence[TableJob]]
 
 
 def paper_table(args: TableArgs, observe: Observer = silent, pool: Pool = run_each) -> Path:
-    """Do all jobs that are not finished, and write RESULTS/TABLE-PRESET.md and .csv.
-
-    Returns:
-        The page.
+    """Do all jobs that are not finished; write the page RESULTS/TABLE-PRESET.md and its .csv.
 
     Raises:
         InputError: If no capture has a truth, or the preset is none.

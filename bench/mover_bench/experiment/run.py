@@ -27,10 +27,7 @@ THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THR
 def run_each(module: str, jobs: Jobs, workers: int) -> Iterator[int]:
     """Run `python -m MODULE WORDS` for each job; yield its index when it has ended.
 
-    Args:
-        module: Where `main` is.
-        jobs: What is done.
-        workers: How many run at once; 0: as many as there are cores.
+    So many `workers` run at once; 0: as many as there are cores.
     """
     running: list[subprocess.Popen[bytes]] = []
     lock, stopped = Lock(), Event()
@@ -62,10 +59,7 @@ def run_each(module: str, jobs: Jobs, workers: int) -> Iterator[int]:
 
 
 def run_experiment(args: ExperimentArgs, observe: Observer = silent, pool: Pool = run_each) -> Path:
-    """Do all that is not finished, then write the tables.
-
-    Returns:
-        The summary, OUT/SET/summary.md.
+    """Do all that is not finished, then write the tables; the summary, OUT/SET/summary.md.
 
     Raises:
         InputError: If a seed, a variant or a set is none, or pandas is not installed.

@@ -246,14 +246,10 @@ def run_batch(
     ray: RayOptions | None = None,
     retry: bool = False,
 ) -> list[Outcome]:
-    """Run what is not finished, show how far it is on stderr, and write `summary.csv`.
+    """Run what is not finished, show how far it is on stderr, and write `summary.csv` into `out`.
 
-    Args:
-        jobs: What to run.
-        out: Folder of all results.
-        workers: Captures at a time on this machine.
-        ray: Run them on Ray instead.
-        retry: Whether captures that failed before are run again.
+    So many `workers` run at a time on this machine, or all on Ray; `retry` has those again that
+    failed.
     """
     from rich.console import Console
     from rich.progress import track

@@ -44,14 +44,10 @@ class Steps:
         *,
         yours: bool = False,
     ) -> None:
-        """Do a step unless its result is there, made from the same.
+        """Do a step by `work` unless its last file `made` is there, made from the same.
 
-        Args:
-            name: Of the step.
-            made_from: Files, and words for settings.
-            made: The file that the step ends with.
-            work: Does it.
-            yours: Whether a result that was replaced stays, whatever it would be made from now.
+        `made_from` are files, and words for settings; `yours`: a result that was replaced stays,
+        whatever it would be made from now.
         """
         key, number = digest(made_from), f"{self.names.index(name) + 1}/{len(self.names)}"
         before = self.log.get(name, {})
@@ -137,13 +133,9 @@ class BodiesFrom:
 
 
 def make_bodies(bodies: BodiesFrom, video: Path, capture: Path, fit: Callable[[], None]) -> None:
-    """Write CAPTURE/bodies.npz.
+    """Write CAPTURE/bodies.npz: by `fit`, from a file, or by a command.
 
-    Args:
-        bodies: Where they come from.
-        video: The user's file, {video} of a command.
-        capture: The capture; its frames and camera.json are {frames} and {camera} of a command.
-        fit: Fits them to the keypoints of the capture.
+    A command has the user's {video}, and {frames} and {camera} of the capture.
 
     Raises:
         InputError: If the command fails, or what was written cannot be read.
@@ -161,12 +153,7 @@ def make_bodies(bodies: BodiesFrom, video: Path, capture: Path, fit: Callable[[]
 
 
 def run_command_line(flag: str, command: str, places: dict[str, Path]) -> None:
-    """Run a user's command without a shell.
-
-    Args:
-        flag: By which it was given.
-        command: With the names of places in braces, such as {video} and {out}.
-        places: What stands for them.
+    """Run a user's command, given by a flag, without a shell; `places` stand for names in braces.
 
     Raises:
         InputError: If it cannot be run, fails, or leaves nothing at {out}.
@@ -203,11 +190,9 @@ def import_bodies(source: Path, tool: str, capture: Path) -> None:
 
 
 def write_heights(capture: Path, heights: tuple[float, ...]) -> None:
-    """Write how tall people are into people.json, for the room; nothing where no height is known.
+    """Write how tall people are [m] into people.json, for the room; nothing where that is unknown.
 
-    Args:
-        capture: With people.json in it.
-        heights: Of each track in the order of their numbers, or one for all people [m].
+    `heights` are those of the tracks in the order of their numbers, or one for all people.
 
     Raises:
         InputError: If there are others than there are people.

@@ -81,10 +81,7 @@ def range_term(
     """Cost of a change of depth: one error that a person keeps, and one that drifts about it.
 
     So what a seat says about a sitter's depth holds for the same person's way through the room.
-
-    Args:
-        share: See `depth_share`.
-        track: Number of each body's person, from 0.
+    `share` is `depth_share`, `track` the number of each body's person, from 0.
     """
     tracks = int(track.max()) + 1 if len(track) else 0
     count = share.new_zeros(tracks).index_add(0, track, torch.ones_like(share))
@@ -99,11 +96,8 @@ def image_term(
     """Cost of leaving the pixels where the joints were seen.
 
     A body that moves along the ray of its pelvis costs nothing for its size in the image: its size
-    is known no better than its depth, in all frames.
-
-    Args:
-        points_cam: Joints in camera axes, the pelvis first [m].
-        start_cam: The same joints as they were given [m].
+    is known no better than its depth, in all frames. Both have joints in camera axes, as they are
+    and as they were given, the pelvis first [m].
     """
     here, there = points_cam[..., :2], start_cam[..., :2]
     farther = points_cam[:, :1, 2:].clamp_min(NEAR) / start_cam[:, :1, 2:].clamp_min(NEAR)

@@ -69,14 +69,11 @@ class BodyView:
 def bounds_of(
     seen: BodyView, objects: Bool[Tensor, "objects h w"], erode: int, vote: bool = True
 ) -> DepthMaps:
-    """Bounds from one body in one frame.
+    """Bounds from one body in one frame; `objects` are masks in the clean image.
 
-    Args:
-        seen: The drawn body and the masks.
-        objects: Masks of the objects in the clean image.
-        erode: Pixels by which silhouettes and masks shrink, so that rays that graze the body and
-            borders that leak bound nothing.
-        vote: Of each object only the larger region counts: it is hidden or hides, not both.
+    Silhouettes and masks shrink by `erode` pixels, so that rays that graze the body and borders
+    that leak bound nothing. With a `vote` only the larger region of each object counts: it is
+    hidden or hides, not both.
     """
     body = eroded(seen.front.isfinite(), erode)
     shown = body & eroded(seen.visible, erode)

@@ -40,21 +40,17 @@ def bbox_term(
     form: Variant,
     wider: float = 0.0,
 ) -> Float[Tensor, "*starts objects"]:
-    r"""Distance between projected and detected boxes.
+    r"""Distance between projected and detected boxes [px at 640], or in box sizes (`robust`).
 
     Paper: the eight corners of the 3D box, an l1 norm of x_min, y_min and width. Robust: all four
     sides of the mesh's extent, each divided by the box's size \sqrt{w h}, so that near and far
-    objects count the same. Where the border of the image or something in front may hide more of
-    the object, it reaches at least as far as it is seen, and may reach farther: beyond the border
-    free of cost, behind something at a bounded cost.
+    objects count the same. Where the border of the image or something in front may hide more of the
+    object, it reaches at least as far as it is seen, and may reach farther: beyond the border free
+    of cost, behind something at a bounded cost.
 
-    Args:
-        pixels: Projected corners (`paper`) or vertices [px].
-        detected: x_min, y_min, x_max, y_max [px].
-        sides: `UNKNOWN`, `SEEN`, `LEAST` or `LIKELY`; an object without a box costs nothing.
-        width: Width of the image [px].
-        form: How it is weighted; [px at 640] for `paper`, else box sizes.
-        wider: How far the true sides lie outside the detected ones [px] (`robust` only).
+    `pixels` are projected corners (`paper`) or vertices, `detected` x_min, y_min, x_max, y_max, of
+    an image `width` wide; the true sides lie farther out by `wider` (`robust` only) [px]. `sides`
+    has `UNKNOWN`, `SEEN`, `LEAST` or `LIKELY`; an object without a box costs nothing.
     """
     drawn = torch.cat([pixels.amin(-2), pixels.amax(-2)], -1)
     if form == "robust":

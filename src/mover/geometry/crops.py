@@ -10,13 +10,9 @@ from mover.geometry.raster import Crops
 def crop_views(
     K: Float[Tensor, "3 3"], boxes: Float[Tensor, "items 4"], margin: float, size: int
 ) -> Crops:
-    """One square window around each box.
+    """A square window, `size` pixels wide, around each box x_min, y_min, x_max, y_max [px].
 
-    Args:
-        K: Intrinsics of the image [px].
-        boxes: x_min, y_min, x_max, y_max [px].
-        margin: Share by which a window is larger than the larger side of its box.
-        size: Pixels along a side of the window.
+    It is larger by the share `margin` than the larger side of its box.
     """
     center = (boxes[:, :2] + boxes[:, 2:]) / 2
     side = (boxes[:, 2:] - boxes[:, :2]).amax(-1).clamp_min(2) * (1 + margin)

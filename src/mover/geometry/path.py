@@ -58,11 +58,8 @@ def resampled(
 ) -> Bool[Tensor, "images *depths wh ww"]:
     """Images of another camera where it sees the surface that this one sees at each pixel.
 
-    Args:
-        image: Of the other camera, with the same intrinsics.
-        depth: Of the surface in a window of this camera [m].
-        views: Intrinsics, and rows and columns of the window.
-        pose: One, of the other camera in the axes of this one.
+    Both have the same intrinsics, which `views` has with the rows and columns of the window in
+    which the depth [m] is known; the one pose is that of the other camera in the axes of this one.
     """
     K, (rows, columns) = views
     y, x = (

@@ -83,13 +83,9 @@ def rest_on_support(
     heights: Float[Tensor, " objects"],
     ground: float,
 ) -> Layout:
-    """Eliminate the height of objects that stand on the ground or on another object.
+    """Eliminate the height of objects that stand on the ground [m] or on another object.
 
-    Args:
-        layout: Places whose y counts only for free objects.
-        supports: As in `Objects.supports`.
-        heights: Height of each object's box at its initial size [m].
-        ground: Height of the floor [m].
+    `supports` are those of `Objects`, `heights` those of the boxes at their initial size [m].
     """
     t = layout.t_world_object
     tops = ground + heights * layout.log_scale[..., 1].exp()

@@ -71,10 +71,7 @@ def level_set(
 def _closed_part(verts: np.ndarray, faces: np.ndarray, largest: float) -> list[Triangles] | None:
     """A connected part as manifold solids, wound outward, and sheets; None if it is open.
 
-    Args:
-        verts: Vertices of all parts.
-        faces: Triangles of this one.
-        largest: Area of the largest hole to cap [m²].
+    `verts` are those of all parts; holes up to the area `largest` are capped [m²].
     """
     import igl
 

@@ -155,12 +155,8 @@ def winding(verts: np.ndarray, faces: np.ndarray, shape: np.ndarray) -> np.ndarr
     """Winding number of the surface at integer places (x, y, z) below `shape`.
 
     Counts signed crossings along the y lines. Coordinates x and z are snapped to fixed point and
-    the top-left rule decides ties, so that a line through a shared edge or vertex counts once.
-
-    Args:
-        verts: In cells: the centres of cells have integer coordinates.
-        faces: Of a closed surface.
-        shape: Number of places along each axis.
+    the top-left rule decides ties, so that a line through a shared edge or vertex counts once. The
+    vertices are in cells, whose centres have integer coordinates.
     """
     from mover.geometry.kernels.bodies import Body
 

@@ -32,15 +32,9 @@ def union_bodies(
 ) -> Volume:
     """V = min over the bodies, and what `grid` holds, of the signed distance to each [m].
 
-    Exact inside the bodies and up to two cells outside; further away as in `grid`. The result
-    does not depend on the number of workers, and memory not on that of bodies.
-
-    Args:
-        verts: Closed bodies in the world [m].
-        faces: Their triangles, one orientation, outward or inward.
-        grid: Where to measure; `grid_around` makes an empty one.
-        workers: Bodies measured at the same time.
-        observe: Called with (bodies done, bodies) after each body.
+    Exact inside the bodies and up to two cells outside; further away as in `grid`. The result does
+    not depend on the number of workers, and memory not on that of bodies, which are closed and
+    wound outward or inward. `observe` is called with (bodies done, bodies) after each.
 
     Raises:
         ValueError: If a vertex is not finite.

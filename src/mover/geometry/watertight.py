@@ -126,13 +126,9 @@ def close_mesh(mesh: Mesh, cells: int = 96) -> Mesh:
     """One closed mesh, wound counter-clockwise seen from outside, in the box of the input.
 
     A closed, consistently wound mesh passes through: turned over if it is inside out, with
-    duplicate vertices merged. Several closed parts are united. Everything else (holes,
-    double-sided faces, soups) is wrapped at a resolution of 1/cells of the longest side, which has
-    no use for more than `LIGHT` triangles.
-
-    Args:
-        mesh: Triangles of any kind; degenerate ones and unused vertices do not count.
-        cells: Resolution along the longest side where the mesh must be wrapped.
+    duplicate vertices merged. Several closed parts are united. Everything else (holes, double-sided
+    faces, soups) is wrapped at a resolution of 1/cells of the longest side, which has no use for
+    more than `LIGHT` triangles. Degenerate ones and unused vertices do not count.
 
     Raises:
         ValueError: If the mesh has no triangle with an area, or vertices that are not finite.

@@ -156,14 +156,8 @@ def parsed_with(
 ) -> tuple[T, C]:
     """The same, and the configuration with the settings that flags change.
 
-    `--help` shows the command's own flags, `--help-all` the settings as well.
-
-    Args:
-        kind: The dataclass of the command's own arguments.
-        config: What the flags change.
-        settings: The settings in it that are flags, by their dotted names, and their help.
-        prog: The command's name.
-        arguments: What was typed after it.
+    `--help` shows the command's own flags, `--help-all` the settings as well. Those that are flags
+    stand in `settings` by their dotted names, with their help.
 
     Raises:
         InputError: If a setting is out of its range.

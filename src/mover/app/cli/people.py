@@ -14,7 +14,7 @@ from mover.app.cli.config import chosen_config, parsed, parsed_with
 from mover.core.errors import InputError
 from mover.core.settings import Index, Rate, float_in
 from mover.fitting.config import FITS, FitConfig
-from mover.io.formats import listing, names
+from mover.io.formats import chosen, listing, names
 
 TOOLS = f"The tool that wrote the source; see docs/data.md.\n{listing('people', 'keypoints')}"
 
@@ -53,9 +53,7 @@ def bodies(arguments: Sequence[str]) -> None:
     args = parsed(BodiesArgs, "mover import-bodies", arguments)
     if args.model_folder is not None:
         os.environ["MOVER_BODY_MODELS"] = str(args.model_folder)
-    if args.tool not in names("people", "keypoints"):
-        known = ", ".join(names("people", "keypoints"))
-        raise InputError(f"TOOL: {args.tool!r} is none of {known}")
+    chosen("TOOL", args.tool, "people", "keypoints")
     from mover.io.capture.bodies_file import odd_bodies, write_bodies
     from mover.io.capture.camera_file import camera_of
     from mover.io.files.cameras import read_camera_file

@@ -2,12 +2,12 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
-from tyro.conf import Fixed, Positional, Suppress, arg
+from tyro.conf import Positional, arg
 
 from mover.app.chain import (
     FIT,
@@ -56,15 +56,13 @@ class LayoutArgs:
     the capture, for `mover run`, too."""
     meshes: Path | None = None
     """Folder with your own shapes, named after their class: chair_0.obj."""
-    config: Suppress[Fixed[LayoutConfig]] = field(default_factory=LayoutConfig)
 
 
 def layout(arguments: Sequence[str]) -> None:
     """`mover layout`."""
-    args, config = parsed_with(
-        LayoutArgs, LayoutConfig(), LAYOUT_SETTINGS, "mover layout", arguments
-    )
-    layout_into(replace(args, config=config))
+    settings = LayoutConfig(), LAYOUT_SETTINGS
+    args, config = parsed_with(LayoutArgs, *settings, "mover layout", arguments)
+    layout_into(args, config)
     say(f"next: mover check {args.capture}; mover run {args.capture} --out OUT")
 
 
@@ -94,7 +92,7 @@ def take_depth(depth: Path, capture: Path) -> None:
     find_depth_file(capture)
 
 
-def layout_into(args: LayoutArgs) -> None:
+def layout_into(args: LayoutArgs, config: LayoutConfig) -> None:
     """Write the first scene into the capture."""
     import torch
 
@@ -114,7 +112,7 @@ def layout_into(args: LayoutArgs) -> None:
     with Bar() as bar:
         run = Run(args.capture / "perceived", bar)
         picture = seen_from(picture, read_bodies(people) if people.is_file() else None, run)
-        first = first_scene(picture, args.config, run, args.meshes)
+        first = first_scene(picture, config, run, args.meshes)
     write_first_scene(first, args.capture, guess)
     ground = first.scene.ground
     height = "" if ground is None else f", camera {-ground:.2f} m above the floor"
@@ -195,34 +193,30 @@ class VideoArgs:
     """Settings of the room: paper or robust."""
     device: Device = "cpu"
     """Where the room is computed: cpu, cuda or auto."""
-    config: Suppress[Fixed[PerceiveConfig]] = field(default_factory=PerceiveConfig)
 
 
 def video(arguments: Sequence[str]) -> None:
     """`mover video`."""
-    args, config = parsed_with(
-        VideoArgs, PerceiveConfig(), PERCEIVE_SETTINGS, "mover video", arguments
-    )
-    video_to_room(replace(args, config=config))
+    settings = PerceiveConfig(), PERCEIVE_SETTINGS
+    args, config = parsed_with(VideoArgs, *settings, "mover video", arguments)
+    video_to_room(args, config=config)
 
 
-def video_to_room(args: VideoArgs, finders: "Finders | None" = None) -> None:
-    """All steps; what cannot work is said before the first.
-
-    Args:
-        args: What is asked.
-        finders: What stands for the networks; None: they themselves.
+def video_to_room(
+    args: VideoArgs, finders: "Finders | None" = None, config: PerceiveConfig | None = None
+) -> None:
+    """All steps; what cannot work is said before the first; `finders` stand for the networks.
 
     Raises:
         InputError: If something is missing, or there is no furniture.
     """
-    source = args.source  # in the first second: nothing heavy is loaded yet
+    source, config = args.source, config or PerceiveConfig()
     if not source.exists():
         raise InputError(f"{source}: there is no such file, expected a video or a folder")
     preset_named(args.preset)
     BodiesFrom(args.bodies, args.bodies_tool).check()
     if finders is None:
-        _check_needs(args)
+        _check_needs(args, config)  # in the first second: nothing heavy is loaded yet
     from mover.perceive.video import pictures_of, read_picture, stamp_of
 
     pictures = pictures_of(source)
@@ -232,10 +226,11 @@ def video_to_room(args: VideoArgs, finders: "Finders | None" = None) -> None:
     capture, steps = args.out / "capture", steps_in(args.out, say, STEPS)
     lens = args.camera, args.fov
     own = [args.people_masks, args.objects, None if OUT in args.keypoints else Path(args.keypoints)]
-    seen = [str((str(source.resolve()), *stamp_of(source))), repr(args.config), *map(str, lens)]
+    seen = [str((str(source.resolve()), *stamp_of(source))), repr(config), *map(str, lens)]
     seen += [args.keypoints, str(args.objects_frame), *("none" if p is None else p for p in own)]
-    steps.do(STEPS[0], seen, capture / "objects.json", lambda: _pictures(args, capture, finders))
-    if not json.loads((capture / "objects.json").read_text())["annotations"]:
+    made = capture / "objects.json"
+    steps.do(STEPS[0], seen, made, lambda: _pictures(args, config, capture, finders))
+    if not json.loads(made.read_text())["annotations"]:
         raise InputError(
             f"{capture / 'reference.png'}: the network finds no furniture in it, so there is "
             "nothing to place; --score 0.3 keeps weaker detections"
@@ -247,7 +242,9 @@ def video_to_room(args: VideoArgs, finders: "Finders | None" = None) -> None:
     _room(capture, args)
 
 
-def _pictures(args: VideoArgs, capture: Path, finders: "Finders | None") -> None:
+def _pictures(
+    args: VideoArgs, config: PerceiveConfig, capture: Path, finders: "Finders | None"
+) -> None:
     """All of the capture but bodies and the first scene."""
     import torch
 
@@ -259,11 +256,11 @@ def _pictures(args: VideoArgs, capture: Path, finders: "Finders | None") -> None
     with Bar() as bar:
         run = Run(capture / "perceived", bar)
         video = Video(args.source, Lens(args.camera, args.fov), _own(args, capture))
-        perceive(video, capture, args.config, run, say, finders or Finders())
+        perceive(video, capture, config, run, say, finders or Finders())
     say(f"{capture}: wrote frames/, reference.png, objects.json, people.json, camera.json")
 
 
-def _check_needs(args: VideoArgs) -> None:
+def _check_needs(args: VideoArgs, config: PerceiveConfig) -> None:
     """Refuse to begin where what is still needed is missing; furniture may be outlined later.
 
     Raises:
@@ -280,7 +277,7 @@ def _check_needs(args: VideoArgs) -> None:
         )
     masks = args.people_masks is None and args.keypoints != MEDIAPIPE
     kinds = [*(["masks"] if masks else []), *(["keypoints"] if args.keypoints == NETWORK else [])]
-    check_needs(args.config.models, kinds, mediapipe=args.keypoints == MEDIAPIPE)
+    check_needs(config.models, kinds, mediapipe=args.keypoints == MEDIAPIPE)
 
 
 def _own(args: VideoArgs, capture: Path) -> "Own":
@@ -319,10 +316,8 @@ def _bodies(capture: Path, args: VideoArgs, steps: Steps) -> None:
         camera = capture / "camera.json"
         fit_into(FitArgs(keypoints, camera, out=made, drop=True, height=args.height))
 
-    def work() -> None:
-        make_bodies(bodies, args.source, capture, fit)
-
-    steps.do(STEPS[1], made_from, made, work, yours=args.bodies == FIT)
+    steps.do(STEPS[1], made_from, made, lambda: make_bodies(bodies, args.source, capture, fit),
+             yours=args.bodies == FIT)  # fmt: skip
 
 
 def _first_scene(capture: Path, args: VideoArgs, steps: Steps) -> None:
@@ -335,7 +330,7 @@ def _first_scene(capture: Path, args: VideoArgs, steps: Steps) -> None:
     made_from += [str(args.meshes), *([] if own is None else [own[0]])]
     asked = LayoutArgs(capture, args.depth, args.meshes)
     made = capture / "scene.json"
-    steps.do(STEPS[2], made_from, made, lambda: layout_into(asked), yours=True)
+    steps.do(STEPS[2], made_from, made, lambda: layout_into(asked, LayoutConfig()), yours=True)
 
 
 def lens_in(capture: Path) -> str:

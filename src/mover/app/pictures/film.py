@@ -26,12 +26,7 @@ def save_still(picture: Float[Tensor, "h w 3"], path: Path) -> None:
 
 
 def save_film(pictures: Iterable[Float[Tensor, "h w 3"]], rate: float, path: Path) -> int:
-    """Write a film and return its number of pictures, which all have one even size.
-
-    Args:
-        pictures: One after the other.
-        rate: Pictures a second.
-        path: Of the .mp4.
+    """Write an .mp4 of so many pictures a second, which all have one even size; their number.
 
     Raises:
         InputError: If PyAV is not installed.
@@ -72,12 +67,10 @@ def pixels(picture: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
 def video_pictures(
     capture: Path, frames: Sequence[int], size: tuple[int, int]
 ) -> Iterator[Float[Tensor, "h w 3"] | None]:
-    """The wanted pictures of a capture's video in order, None for those that are missing.
+    """The pictures of rising numbers of a capture's video, None for those that are missing.
 
-    Args:
-        capture: Folder with frames/000000.jpg, ... or video.mp4.
-        frames: Their numbers, rising.
-        size: Width and height that they get [px].
+    The video is frames/000000.jpg, ... or video.mp4; `size` is the width and height that they get
+    [px].
     """
     film = next((f for f in (capture / VIDEO, capture / FRAMES / VIDEO) if f.is_file()), None)
     if film is None:

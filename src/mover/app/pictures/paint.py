@@ -93,16 +93,10 @@ def joined(parts: list[Surfaces]) -> Surfaces:
 def draw_picture(
     surfaces: Surfaces, camera: Camera, base: Float[Tensor, "h w 3"], ground: float | None = None
 ) -> tuple[Float[Tensor, "h w 3"], Int[Tensor, "fine_h fine_w"]]:
-    """Surfaces over a picture of a camera.
+    """Surfaces over a picture `base` of a camera, of any size.
 
-    Args:
-        surfaces: Furniture and people.
-        camera: Whose picture it is, of any size.
-        base: What is behind.
-        ground: Height of the floor, whose lines are drawn [m]; None: none.
-
-    Returns:
-        The picture, and the owners of its pixels, `FINE` along each side of one.
+    The lines of the floor are drawn where its height `ground` [m] is known. Also returned are the
+    owners of the pixels, `FINE` along each side of one.
     """
     camera = sized_camera(camera, base.shape[1], base.shape[0])
     drawn = draw(surfaces, sized_camera(camera, FINE * camera.width, FINE * camera.height))

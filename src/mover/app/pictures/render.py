@@ -31,13 +31,9 @@ FPS = 5.0  # of images that have no time
 
 
 def render_result(out: Path, path: Path, config: RenderConfig, capture: Path | None = None) -> int:
-    """Draw a result into a file; the number of pictures.
+    """Draw a result into a .png, .jpg, .jpeg or .mp4; the number of pictures.
 
-    Args:
-        out: Folder of the result.
-        path: .png, .jpg, .jpeg or .mp4.
-        config: What is drawn.
-        capture: Folder of the capture, whose video (or reference image) is behind the furniture.
+    The video of the capture, or its reference image, is behind the furniture.
 
     Raises:
         InputError: If something is missing or the ending of `path` is none of these.

@@ -70,12 +70,7 @@ TILES = ("iou3d", "center_error", "contact_f1", "pitch_error")
 
 
 def write_report(out: Path, content: ReportContent) -> Path:
-    """Write the page, all at once, and return where it is.
-
-    Args:
-        out: The file, or the folder that gets `report.html`.
-        content: What to show.
-    """
+    """Write the page, all at once, into a file or as `report.html` of a folder; where it is."""
     content = map_tensors(on_cpu, content)
     path = out if out.suffix == ".html" else out / "report.html"
     with replacing(path) as part:
@@ -157,10 +152,7 @@ def _plans(content: ReportContent) -> list[tuple[str, str]]:
     )
     things = [thing for _, *both in sides for thing in both]
     extent = extent_of(*things, content.truth)
-    return [
-        (name, draw_top(scene, content.truth, bodies, extent=extent))
-        for name, scene, bodies in sides
-    ]
+    return [(n, draw_top(scene, content.truth, b, extent=extent)) for n, scene, b in sides]
 
 
 def _view(content: ReportContent) -> ReportScene:

@@ -54,11 +54,8 @@ def draw_top(
 ) -> str:
     """Plan of `scene` as inline SVG: x to the right, away from the camera upwards.
 
-    Args:
-        scene: Filled footprints with arrows at their fronts.
-        truth: Dashed footprints, in the truth's own world.
-        bodies: People in the world of `scene`; their pelvises and soles are dotted.
-        extent: Part of the floor to show; None: everything.
+    Filled footprints with arrows at their fronts; dashed ones of the truth in its own world; dots
+    at pelvises and soles of people in the world of `scene`. Without `extent` everything is shown.
     """
     extent = extent or extent_of(scene, truth, bodies)
     wide = max(extent.right - extent.left, extent.near - extent.far)  # a page may show more

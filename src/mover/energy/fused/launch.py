@@ -77,11 +77,8 @@ def fused_cost(
 ) -> tuple[Float[Tensor, "*starts objects"], Float[Tensor, "*starts objects terms"]]:
     """The sum of the terms and the terms, with their weights; differentiable once.
 
-    Args:
-        fused: The kernel and its memory.
-        layout: Where the objects are.
-        rows: Which of (starts x objects) these are, each at most once; None: all, in their order.
-        turn: From the world to the camera, a rotation, if it is another than the kernel's.
+    `rows` says which of (starts x objects) the layout holds, each at most once (None: all, in their
+    order); `turn` is the rotation from the world to the camera, if it is another than the kernel's.
     """
     at = torch.cat([layout.t_world_object, layout.yaw.unsqueeze(-1), layout.log_scale], -1)
     whole, parts = _Cost.apply(at, fused, rows, turn)

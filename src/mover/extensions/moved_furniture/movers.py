@@ -73,11 +73,7 @@ def follow_mover(
 ) -> Followed | None:
     """The person who moves an object from one stay to the next; None: none is seen to do so.
 
-    Args:
-        between: The two stays.
-        bodies: All people in the world.
-        parts: Of these bodies.
-        ground: Height of the floor [m].
+    All people are in the world, whose floor is at the height `ground` [m].
     """
     if bodies.fps is None:
         return None

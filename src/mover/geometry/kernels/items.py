@@ -118,8 +118,7 @@ def show(scene: Items, scratch: Scratch, maps: MapArrays, item: int, row: int) -
 def draw_item(scene: Items, scratch: Scratch, maps: MapArrays, backs: int, item: int) -> wp.vec2i:
     """Put the triangles of one item into the z-buffers, and find the cuts of its outline.
 
-    Returns:
-        The first row that it may cover and the row after the last.
+    Returned are the first row that it may cover and the row after the last.
     """
     low = float(scene.height)
     high = float(0.0)
