@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from math import prod
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from mover.geometry.camera import NEAR
-from mover.geometry.raster.draw import Crops, Depths, Layers, Topology
+from mover.geometry.raster.draw import Crops, Depths, Topology
 
 BORDER = 1  # [px], as in the kernels
 TINY = 1e-12  # [px], keeps the slope of level edges finite; their rows use its sign only
@@ -143,44 +143,6 @@ def _seen(
         for runs, keys in ((fronts, near), (backs, far))
     )
     return image, Depths(nearest, farthest, inside(covered))
-
-
-def layers(
-    verts_cam: Float[Tensor, "items verts 3"], faces: Int[Tensor, "faces 3"], views: Crops
-) -> Layers:
-    """See `raster.layers`."""
-    items, n_verts, _ = verts_cam.shape
-    size = (items, views.height, views.width)
-    if items == 0:
-        return Layers(*verts_cam.new_zeros(2, *size))
-    base = torch.arange(items, device=verts_cam.device) * n_verts
-    table = _rows(faces.long() + base[:, None, None])
-    screen = on_screen(verts_cam, views.K, size[1:])
-    area, found = signed_areas(screen, table), []
-    for none, facing in ((torch.inf, area < 0), (-torch.inf, area > 0)):
-        keys = zbuffer(screen, spans(screen, table, facing))
-        found.append(torch.where(keys > 0, 1 / inverse_depth(keys), none).view(size).to(verts_cam))
-    return Layers(*found)
-
-
-def first_hit(
-    verts_cam: Float[Tensor, "verts 3"],
-    faces: Int[Tensor, "faces 3"],
-    K: Float[Tensor, "3 3"],
-    size: tuple[int, int],
-) -> tuple[Float[Tensor, "h w"], Int[Tensor, "h w"]]:
-    """See `raster.first_hit`."""
-    table = faces.long().T.contiguous()
-    screen = on_screen(verts_cam[None], K[None], size)
-    runs = spans(screen, table, signed_areas(screen, table) != 0)
-    keys = zbuffer(screen, runs)
-    pixel = torch.nonzero(keys)[:, 0]
-    seen = keys.index_select(0, pixel)
-    depth = torch.full_like(keys, torch.inf, dtype=verts_cam.dtype)
-    depth[pixel] = (1 / inverse_depth(seen)).to(depth)
-    face = torch.full_like(keys, -1)
-    face[pixel] = runs.face.index_select(0, seen & LOW)
-    return depth.view(size), face.view(size)
 
 
 def ragged(count: Tensor) -> tuple[Tensor, Tensor]:

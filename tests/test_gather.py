@@ -8,6 +8,7 @@ from mover.energy.human_terms import BodyView, DepthMaps, bounds_of, merge
 from mover.stages.contacts.assign_contacts import in_turns, thin
 
 H, W = 12, 20
+NOTHING = torch.zeros(H, W, dtype=torch.bool)
 
 
 def seen(visible, others=None):
@@ -17,8 +18,7 @@ def seen(visible, others=None):
     far = torch.full((H, W), float("inf"))
     front = torch.where(covered, torch.tensor(2.0), far)
     exit_ = torch.where(covered, torch.tensor(2.3), -far)
-    none = torch.zeros(H, W, dtype=torch.bool)
-    return BodyView(front, exit_, visible, none if others is None else others)
+    return BodyView(front, exit_, visible, NOTHING if others is None else others)
 
 
 def columns(first, last):
@@ -35,8 +35,7 @@ def test_an_object_behind_a_seen_person_is_not_nearer_than_where_the_ray_leaves_
 
 
 def test_an_object_that_hides_a_person_is_not_farther_than_where_the_ray_enters_the_body():
-    nothing = torch.zeros(H, W, dtype=torch.bool)
-    found = bounds_of(seen(nothing), columns(6, 12)[None], 1)
+    found = bounds_of(seen(NOTHING), columns(6, 12)[None], 1)
     assert (found.far[:, 6:12] == 2.0).all()
     assert not found.near.isfinite().any()
 
@@ -49,8 +48,7 @@ def test_rays_that_graze_the_body_bound_nothing():
 
 
 def test_one_person_hidden_by_another_says_nothing_about_the_furniture():
-    nothing = torch.zeros(H, W, dtype=torch.bool)
-    found = bounds_of(seen(nothing, columns(0, 20)), columns(6, 12)[None], 1)
+    found = bounds_of(seen(NOTHING, columns(0, 20)), columns(6, 12)[None], 1)
     assert not found.far.isfinite().any()
 
 
@@ -89,11 +87,10 @@ def test_thinning_keeps_every_weight_and_does_not_grow_with_the_video():
 
 
 def test_what_a_wrong_outline_explains_is_not_hidden():
-    nothing = torch.zeros(H, W, dtype=torch.bool)
     thin_strip = columns(4, 14)  # two of the twelve columns of the body are not seen
     found = bounds_of(replace(seen(thin_strip), reach=2.0), columns(0, 20)[None], 0)
     assert not found.far.isfinite().any()
-    found = bounds_of(replace(seen(nothing), reach=2.0), columns(0, 20)[None], 0)
+    found = bounds_of(replace(seen(NOTHING), reach=2.0), columns(0, 20)[None], 0)
     assert (found.far[:, 6:14] == 2.0).all()
     assert not found.far[:, [4, 15]].isfinite().any()
 

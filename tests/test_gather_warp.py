@@ -4,41 +4,21 @@ import dataclasses
 
 import numpy as np
 import pytest
-import raster_torch
 import torch
 import trimesh
-from test_volume import centers, moving_spheres, posed_bodies, sphere
-from torch import Tensor
+from test_volume import around, assert_same, moving_spheres, sphere
 
 from mover.core.types import Bodies, Camera, People
 from mover.energy.human_terms import BodyView, DepthMaps, bounds_of, merge
 from mover.geometry import volume_warp
-from mover.geometry.raster import Crops
-from mover.geometry.raster import layers as layers_warp
-from mover.geometry.volume import Volume, grid_around, sample, sample_torch, signed_distance
+from mover.geometry.raster import Crops, layers
+from mover.geometry.volume import Volume, grid_around, sample, sample_torch
 from mover.stages.config import GatherConfig
 from mover.stages.contacts.gather_cues import GatherInputs, depth_bounds
 from mover.stages.masks import mask_table
 from mover_bench.rooms.render import encode
 
 pytest.importorskip("warp")
-
-
-def around(verts: Tensor, cells: int) -> Volume:
-    return grid_around(verts.amin((0, 1)), verts.amax((0, 1)), cells, padding=0.1)
-
-
-def assert_same(verts: Tensor, faces: Tensor, grid: Volume) -> Tensor:
-    """Signs and, where they are promised, distances are those of libigl."""
-    found = volume_warp.union_bodies(verts, faces, grid, 2).values
-    each = torch.stack([signed_distance(centers(grid), body, faces) for body in verts])
-    exact = each.amin(0).reshape(found.shape)
-    same = (found < 0) == (exact < 0)
-    assert same.float().mean() > 0.9999
-    known = (exact.abs() < 1.999 * grid.cell) | (exact < 0)
-    torch.testing.assert_close(found[known & same], exact[known & same], rtol=0, atol=2e-6)
-    assert (found[~known] >= 1.998 * grid.cell).all()
-    return found
 
 
 def test_a_body_that_cuts_into_itself_is_inside_where_its_parts_overlap() -> None:
@@ -51,12 +31,6 @@ def test_a_body_that_cuts_into_itself_is_inside_where_its_parts_overlap() -> Non
     at = place * grid.cell + grid.origin
     within = (at.norm(dim=-1) < 0.49) & ((at - torch.tensor([0.4, 0.1, 0])).norm(dim=-1) < 0.39)
     assert (found.flatten()[within] < 0).all()
-
-
-def test_a_box_of_twelve_triangles_has_the_distances_of_libigl() -> None:
-    shape = trimesh.creation.box((0.41, 0.73, 0.59))
-    verts = torch.from_numpy(shape.vertices.copy()).float()[None]
-    assert_same(verts, torch.from_numpy(shape.faces.copy()), around(verts, 40))
 
 
 def test_a_body_that_leaves_the_grid_is_cut_off() -> None:
@@ -82,41 +56,6 @@ def test_vertices_that_are_not_finite_are_refused_by_their_body(wrong: float) ->
     verts[7, 3] = wrong
     with pytest.raises(ValueError, match="body 7"):
         volume_warp.union_bodies(verts, faces, grid, 3)
-
-
-def cameras(items: int, size: tuple[int, int], focal: float) -> Crops:
-    height, width = size
-    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-    return Crops(K.expand(items, 3, 3), height, width)
-
-
-def assert_same_layers(verts: Tensor, faces: Tensor, views: Crops) -> None:
-    found, exact = (draw(verts, faces, views) for draw in (layers_warp, raster_torch.layers))
-    for mine, other in ((found.front, exact.front), (found.exit, exact.exit)):
-        assert mine.dtype == other.dtype
-        assert torch.equal(mine.isfinite(), other.isfinite())
-        torch.testing.assert_close(mine, other, rtol=0, atol=1e-5)
-
-
-def test_what_is_behind_the_camera_or_beside_the_image_is_not_drawn() -> None:
-    verts, faces = posed_bodies(4)
-    shift = torch.tensor([[0.0, 0.2, 0.3], [0.0, 0, -4.0], [9.0, 0, 3.0], [0.5, 0.8, 2.0]])
-    turned = verts * torch.tensor([1.0, -1.0, -1.0]) + shift[:, None]
-    views = cameras(4, (90, 120), 110.0)
-    assert_same_layers(turned, faces, views)
-    assert_same_layers(turned, faces.int(), views)
-    found = layers_warp(turned, faces, views)
-    assert not found.front[1:3].isfinite().any()
-    assert (turned[0, :, 2] < 0).any()  # a part of it is behind the camera
-    assert found.front[0].isfinite().any()
-    assert found.front[3].isfinite().any()
-
-
-def test_nothing_to_draw_is_nothing_seen() -> None:
-    verts, faces = sphere([0.0, 0, 2.0], 0.5, level=1)
-    assert_same_layers(verts[None][:0], faces, cameras(0, (8, 9), 9.0))
-    assert_same_layers(verts[None], faces[:0], cameras(1, (8, 9), 9.0))
-    assert_same_layers(verts[None].double(), faces, cameras(1, (8, 9), 9.0))
 
 
 SETTINGS = GatherConfig(erode=2)
@@ -150,7 +89,7 @@ def test_bounds_are_those_of_whole_images_one_after_another() -> None:
     views = Crops(sight.camera.K[None], 60, 80)
     for row, verts in enumerate(sight.bodies.verts):
         cam = verts @ sight.camera.R_cam_world.mT
-        drawn = raster_torch.layers(cam[None], sight.bodies.faces, views)
+        drawn = layers(cam[None], sight.bodies.faces, views)
         seen = BodyView(drawn.front[0], drawn.exit[0], *table.decode(row))
         expected = merge(expected, bounds_of(seen, sight.masks, 2))
     for workers in (1, 2, 3):
@@ -198,14 +137,6 @@ def test_lookups_of_no_points_and_of_points_that_are_no_numbers() -> None:
     assert sample(field, torch.full((1, 3), torch.nan)).shape == (1,)
 
 
-def test_bricks_are_busy_where_the_field_changes() -> None:
-    field = some_field((20, 33, 26))
-    assert field.busy.shape == (3, 4, 4)
-    for brick in torch.cartesian_prod(*[torch.arange(n) for n in field.busy.shape]).tolist():
-        cut = tuple(slice(8 * k, 8 * k + 9) for k in brick)
-        assert bool(field.busy[tuple(brick)]) == (field.values[cut].unique().numel() > 1)
-
-
 def test_triangles_without_an_area_change_nothing() -> None:
     one, faces = sphere([0.0, 0, 0], 0.5, level=2)
     a, b = one[faces[0, 0]], one[faces[0, 1]]
@@ -218,8 +149,12 @@ def test_triangles_without_an_area_change_nothing() -> None:
     assert torch.equal(found, assert_same(verts, faces, grid))
 
 
-@pytest.mark.parametrize("level", [0, 2, 4])
-def test_meshes_of_any_size_have_the_distances_of_libigl(level: int) -> None:
-    verts, faces = sphere([0.1, -0.2, 0.3], 0.5, level)
+@pytest.mark.parametrize("level", [None, 0, 2, 4])
+def test_meshes_of_any_size_have_the_distances_of_libigl(level: int | None) -> None:
+    verts, faces = sphere([0.1, -0.2, 0.3], 0.5, level or 0)
+    if level is None:
+        shape = trimesh.creation.box((0.41, 0.73, 0.59))
+        verts, faces = (torch.from_numpy(x.copy()) for x in (shape.vertices, shape.faces))
+    verts = verts.float()
     verts = torch.stack([verts, verts * torch.tensor([1.1, 0.8, 1.0])])
     assert_same(verts, faces, around(verts, 36))

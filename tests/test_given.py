@@ -144,9 +144,8 @@ def test_of_a_room_without_a_guess_the_axis_alone_costs():
     given = given_axis(objects.categories, Heading(0.3, math.radians(0.5)))
     straight = replace(somewhere(2), yaw=torch.full((2,), 0.3 - math.pi))
     skew = replace(straight, yaw=straight.yaw + 0.7)
-    far = replace(
-        straight, t_world_object=3 * straight.t_world_object, log_scale=0.4 + 0 * straight.log_scale
-    )
+    far = replace(straight, t_world_object=3 * straight.t_world_object)
+    far = replace(far, log_scale=0.4 + straight.log_scale)
     along = given_term(straight, given)
     torch.testing.assert_close(along, torch.zeros(2), atol=1e-5, rtol=0)
     torch.testing.assert_close(given_term(far, given), along)
@@ -304,24 +303,25 @@ def test_sides_that_may_be_hidden_and_those_beside_them_bound_nothing_of_a_shape
     assert found.tolist() == [fits, sides]
 
 
+def touched_by(object_of: list[int], heading: list[list[float]], across: list[bool]):
+    """Touches of which only the directions of those who touch are known."""
+    rows = len(object_of)
+    return ContactPoints(
+        torch.tensor(object_of), torch.zeros(rows, 4, 2, 3), torch.ones(rows, 4, 2),
+        torch.ones(rows), torch.ones(rows, 4), torch.tensor(heading), torch.tensor(across),
+    )  # fmt: skip
+
+
 def test_of_what_people_use_a_guess_says_less_beside_them() -> None:
     given = replace(given_at(somewhere(3)), weight=torch.tensor([4.0, 4.0, 4.0]))
-    touched = ContactPoints(
-        object_of=torch.tensor([1]), points=torch.zeros(1, 4, 2, 3),
-        weight=torch.ones(1, 4, 2), bodies=torch.ones(1), share=torch.ones(1, 4),
-        heading=torch.zeros(1, 2), across=torch.tensor([False]),
-    )  # fmt: skip
+    touched = touched_by([1], [[0.0, 0.0]], [False])
     trust = torch.full((3,), 0.25)
     assert lighter_where_used(given, trust, touched).weight.tolist() == [4.0, 1.0, 4.0]
     assert lighter_where_used(given, trust, None) is given
 
 
 def test_sitters_turn_chairs_to_where_they_face_and_beds_across_it_to_either_side() -> None:
-    touched = ContactPoints(
-        object_of=torch.tensor([0, 1]), points=torch.zeros(2, 4, 2, 3),
-        weight=torch.ones(2, 4, 2), bodies=torch.ones(2), share=torch.ones(2, 4),
-        heading=torch.tensor([[0.0, 1.0]] * 2), across=torch.tensor([False, True]),
-    )  # fmt: skip
+    touched = touched_by([0, 1], [[0.0, 1.0]] * 2, [False, True])
     quarters = math.pi / 2 * torch.arange(4)[:, None].expand(4, 2)
     starts = Layout(torch.zeros(4, 2, 3), quarters, torch.zeros(4, 2, 3))
     found = heading_term(starts, touched)

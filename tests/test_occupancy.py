@@ -22,6 +22,10 @@ from mover.geometry.occupancy import (
 from mover.geometry.topology import is_closed
 
 SMALL = ExtractConfig(coarse=8, levels=2)
+CORNER = Mesh(
+    torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]),
+    torch.tensor([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]),
+)
 
 
 def published(hidden: int, code: int, decoder: int) -> dict[str, tuple[int, ...]]:
@@ -119,10 +123,8 @@ def test_it_computes_what_its_equations_say():
     found = network.decode(points, network.encode(clouds))
     expected = [[by_hand(state, clouds[i], points[i, j]) for j in range(4)] for i in range(2)]
     torch.testing.assert_close(found, torch.tensor(expected), rtol=1e-4, atol=1e-4)
-    again = network.decode(
-        points, network.encode(clouds.flip(1))
-    )  # the order of a cloud's points does not count
-    torch.testing.assert_close(again, found)
+    again = network.decode(points, network.encode(clouds.flip(1)))
+    torch.testing.assert_close(again, found)  # the order of a cloud's points does not count
 
 
 def test_old_checkpoints_do_not_count_batches_and_a_latent_code_is_at_its_mean():
@@ -228,9 +230,8 @@ def test_the_shape_comes_back_in_its_own_box_and_axes(monkeypatch: pytest.Monkey
     monkeypatch.setattr(OccupancyNetwork, "encode", encode)
     monkeypatch.setattr(OccupancyNetwork, "decode", decode)
     network = OccupancyNetwork({})
-    verts = torch.tensor([[0.0, 0, 0], [2, 0, 0], [0, 1, 0], [0, 0, 4]])
-    faces = torch.tensor([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
-    closed = occupied_mesh(network, Mesh(verts, faces), SMALL)
+    verts = CORNER.verts * torch.tensor([2.0, 1.0, 4.0])
+    closed = occupied_mesh(network, Mesh(verts, CORNER.faces), SMALL)
     assert is_closed(closed.faces)
     assert signed_volume(closed) > 0
     torch.testing.assert_close(torch.stack(box(closed.verts)), torch.stack(box(verts)))
@@ -247,10 +248,7 @@ def test_the_shape_comes_back_in_its_own_box_and_axes(monkeypatch: pytest.Monkey
 def test_a_network_of_this_size_runs_on_a_mesh():
     state = random_state(published(16, 16, 16))
     state["decoder.fc_out.bias"].fill_(5.0)
-    verts = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
-    faces = torch.tensor([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
-    closed = occupied_mesh(network_of(state), Mesh(verts, faces), SMALL)
-    assert is_closed(closed.faces)
+    assert is_closed(occupied_mesh(network_of(state), CORNER, SMALL).faces)
 
 
 def test_furniture_is_closed_by_the_checkpoint_that_the_user_names(

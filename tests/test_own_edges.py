@@ -43,12 +43,8 @@ def segments_of(ends: Tensor, error: float = 1e-3) -> Segments:
     return Segments(ends.mean(1) - K[:2, 2].double(), along, error * one, one, one.long())
 
 
-def everywhere(view: Camera) -> Tensor:
-    return torch.ones(1, view.height, view.width, dtype=torch.bool)
-
-
-def nowhere(view: Camera) -> Tensor:
-    return torch.zeros(view.height, view.width, dtype=torch.bool)
+EVERYWHERE = torch.ones(1, 540, 960, dtype=torch.bool)
+NOWHERE = torch.zeros(540, 960, dtype=torch.bool)
 
 
 def off(yaw: Tensor, true: float) -> Tensor:
@@ -62,7 +58,7 @@ def off(yaw: Tensor, true: float) -> Tensor:
 def test_level_edges_of_a_box_tell_its_yaw_and_upright_ones_nothing(yaw: float, pitch: float):
     view = camera(pitch)
     ends = ends_of(yaw, (0.9, -1.4, -4.0), view)
-    found = own_edges(segments_of(ends), everywhere(view), nowhere(view), view)
+    found = own_edges(segments_of(ends), EVERYWHERE, NOWHERE, view)
     assert len(found.yaw) == 8
     torch.testing.assert_close(off(found.yaw, yaw), torch.zeros(8), atol=1e-4, rtol=0)
 
@@ -70,7 +66,7 @@ def test_level_edges_of_a_box_tell_its_yaw_and_upright_ones_nothing(yaw: float, 
 def test_level_edges_that_look_upright_are_left_out():
     view = camera()
     ends = ends_of(1.2, (0.9, -1.4, -4.0), view)  # one side points nearly at the camera
-    found = own_edges(segments_of(ends), everywhere(view), nowhere(view), view)
+    found = own_edges(segments_of(ends), EVERYWHERE, NOWHERE, view)
     assert len(found.yaw) == 7
     torch.testing.assert_close(off(found.yaw, 1.2), torch.zeros(7), atol=1e-4, rtol=0)
 
@@ -80,14 +76,14 @@ def test_edges_are_as_uncertain_as_they_are_when_their_angles_err():
     ends = ends_of(0.5, (0.9, -1.4, -4.0), view)
     error = 0.004
     exact = segments_of(ends, error)
-    stated = own_edges(exact, everywhere(view), nowhere(view), view)
+    stated = own_edges(exact, EVERYWHERE, NOWHERE, view)
     rolled = []
     for _ in range(400):
         turn = error * torch.randn(len(ends), generator=generator, dtype=torch.float64)
         x, y = exact.along.unbind(-1)
         along = torch.stack([turn.cos() * x - turn.sin() * y, turn.sin() * x + turn.cos() * y], -1)
         noisy = Segments(exact.middle, along, exact.error, exact.vote, exact.group)
-        rolled.append(off(own_edges(noisy, everywhere(view), nowhere(view), view).yaw, 0.5))
+        rolled.append(off(own_edges(noisy, EVERYWHERE, NOWHERE, view).yaw, 0.5))
     spread = torch.stack(rolled).square().mean(0).sqrt()
     torch.testing.assert_close(stated.spread, spread, atol=0, rtol=0.15)
 
@@ -98,7 +94,7 @@ def test_an_edge_belongs_to_the_one_thing_whose_mask_it_is_in_and_not_to_people(
         [[[100.0, 300], [160, 310]], [[300, 300], [360, 310]], [[500, 300], [560, 310]],
          [[700, 300], [760, 310]], [[200, 400], [260, 410]]]
     ).double()  # fmt: skip
-    masks, people = torch.zeros(2, 540, 960, dtype=torch.bool), nowhere(view)
+    masks, people = torch.zeros(2, 540, 960, dtype=torch.bool), NOWHERE.clone()
     masks[0, 280:320, 100:340] = True  # the first, the second
     masks[1, 280:320, 320:540] = True  # the second, the third
     masks[1, 280:304, 700:760] = True  # the fourth is its outline
@@ -117,7 +113,7 @@ def test_of_things_whose_edges_agree_their_own_axis_counts_else_the_rooms():
     slanted = torch.tensor([[[600.0, 200], [650, 260]], [[700, 400], [740, 380]],
                             [[800, 300], [860, 302]]]).double()  # fmt: skip
     both = segments_of(torch.cat([ends, slanted]), 0.004)
-    edges = own_edges(both, masks, nowhere(view), view)
+    edges = own_edges(both, masks, NOWHERE, view)
     assert set(edges.of.tolist()) == {0, 1}
     given = given_axis(("chair", "chair"), WALLS, edges)
     room = given_axis(("chair", "chair"), WALLS)
@@ -131,7 +127,7 @@ def test_of_things_whose_edges_agree_their_own_axis_counts_else_the_rooms():
 def test_one_edge_that_the_room_contradicts_is_not_believed():
     view = camera()
     one = segments_of(ends_of(0.6, (0.9, -1.4, -4.0), view)[:1], 0.02)
-    edges = own_edges(one, everywhere(view), nowhere(view), view)
+    edges = own_edges(one, EVERYWHERE, NOWHERE, view)
     given, room = given_axis(("bed",), WALLS, edges), given_axis(("bed",), WALLS)
     assert given.axis.tolist() == room.axis.tolist()
 

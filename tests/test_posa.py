@@ -246,12 +246,13 @@ def test_other_networks_and_bodies_are_refused(files, tmp_path):
     with pytest.raises(InputError, match=r"mesh_2\.obj"):
         load_posa(tmp_path / "a.pt", tmp_path)
     posa, bodies = load_posa(tmp_path / "a.pt", files / "mesh_ds"), smplx_people()
-    with pytest.raises(InputError, match="meshes only"):
-        posa_contacts(posa, replace(bodies, pose=None))
-    with pytest.raises(InputError, match="100 vertices"):
-        posa_contacts(posa, replace(bodies, verts=bodies.verts[:, :100]))
-    with pytest.raises(ValueError, match="camera"):
-        posa_contacts(posa, replace(bodies, space="camera"))
+    for error, words, change in (
+        (InputError, "meshes only", {"pose": None}),
+        (InputError, "100 vertices", {"verts": bodies.verts[:, :100]}),
+        (ValueError, "camera", {"space": "camera"}),
+    ):
+        with pytest.raises(error, match=words):
+            posa_contacts(posa, replace(bodies, **change))
 
 
 def test_contacts_of_files_are_matched_by_frame(tmp_path):

@@ -285,25 +285,42 @@ class TestLayers:
         """Two balls that cut into each other, as one body in three places."""
         ball = trimesh.creation.icosphere(3, 0.4)
         both = trimesh.util.concatenate([ball, ball.copy().apply_translation([0.3, 0.1, 0.35])])
-        places = torch.tensor([[0.0, 0, 3], [0.5, -0.3, 2.5], [-2.4, 0, 3]])
+        away = [[0.0, 0, -4], [9, 0, 3]]  # behind the camera, and beside the image
+        places = torch.tensor([[0.0, 0, 3], [0.5, -0.3, 2.5], [-2.4, 0, 3], [0, 0.2, 0.3], *away])
         verts = torch.tensor(np.array(both.vertices), dtype=torch.float32) + places[:, None]
-        K = torch.tensor([[80.0, 0, 50], [0, 80, 40], [0, 0, 1]]).repeat(3, 1, 1)
+        K = torch.tensor([[80.0, 0, 50], [0, 80, 40], [0, 0, 1]]).repeat(len(places), 1, 1)
         return verts, torch.tensor(np.array(both.faces)), Crops(K, 80, 100)
 
     def test_rays_enter_and_first_leave_where_a_ray_caster_says(self, bodies):
+        """Triangles that reach behind the near plane are left out, as of the fourth."""
         verts, faces, views = bodies
-        found = layers(verts, faces, views)
-        for i in range(3):
-            front, _, _, count = cast(verts[i], faces, views.K[i], 80, 100)
-            leave = cast_backs(verts[i], faces, views.K[i], 80, 100)[0]
-            hit = torch.isfinite(found.front[i]).numpy()
-            assert (hit != (count > 0)).sum() <= 2
-            assert (np.isfinite(found.exit[i].numpy()) == hit).all()
-            both = hit & (count > 0)
-            np.testing.assert_allclose(found.front[i].numpy()[both], front[both], atol=1e-5)
-            np.testing.assert_allclose(found.exit[i].numpy()[both], leave[both], atol=1e-5)
-            assert (found.front[i].numpy()[~hit] == np.inf).all()
-            assert (found.exit[i].numpy()[~hit] == -np.inf).all()
+        found, seen = layers(verts, faces.int(), views), []
+        for i in range(len(verts)):
+            kept = faces[(verts[i][faces][..., 2] >= NEAR).all(-1)]
+            for values, none, way in (
+                (found.front[i].numpy(), np.inf, kept.flip(-1)),
+                (found.exit[i].numpy(), -np.inf, kept),
+            ):
+                exact = cast_backs(verts[i], way, views.K[i], 80, 100)[0]
+                hit, wanted = np.isfinite(values), np.isfinite(exact)
+                assert (hit != wanted).sum() <= 2
+                np.testing.assert_allclose(values[hit & wanted], exact[hit & wanted], atol=1e-5)
+                assert (values[~hit] == none).all()
+                seen.append(bool(hit.any()))
+            if i < 3:
+                assert torch.equal(found.front[i].isfinite(), found.exit[i].isfinite())
+        assert seen == [True] * 8 + [False] * 4
+
+    def test_nothing_to_draw_is_nothing_seen_and_precision_is_kept(self, bodies):
+        verts, faces, views = bodies
+        none = Crops(views.K[:0], 8, 9)
+        assert layers(verts[:0], faces, none).front.shape == (0, 8, 9)
+        empty = layers(verts, faces[:0], views)
+        assert (empty.front == torch.inf).all()
+        assert (empty.exit == -torch.inf).all()
+        single, double = layers(verts, faces, views), layers(verts.double(), faces, views)
+        assert torch.equal(single.front.double(), double.front)
+        assert torch.equal(single.exit.double(), double.exit)
 
     def test_first_hit_sees_any_winding(self):
         verts, shape = packed(["chair"])

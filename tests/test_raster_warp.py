@@ -66,14 +66,6 @@ class TestAgreement:
         assert torch.equal(found[3], truth[3])
         torch.testing.assert_close(found[4], truth[4], atol=1e-3, rtol=1e-3)
 
-    def test_first_hits_have_the_bits_of_torch(self):
-        verts_cam, shape, views = scene(["chair"], 70)
-        inputs = verts_cam[0], shape.faces[0], views.K[0], (60, 70)
-        for values, truth in zip(
-            raster_warp.first_hit(*inputs), raster_torch.first_hit(*inputs), strict=True
-        ):
-            assert torch.equal(values, truth)
-
     def test_parts_too_long_to_count_are_drawn_one_after_the_other(self, monkeypatch):
         verts_cam, shape, views = scene(["chair", "sphere"], 40, starts=3)
         whole = pulled(raster_warp, verts_cam, shape, views)

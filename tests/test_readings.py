@@ -191,8 +191,7 @@ def test_each_vertex_touches_the_nearest_object_whose_mask_it_projects_into():
     parts = parts_of(bodies)
     seat = members(parts, "seat", "left_thigh", "right_thigh")
     middle = bodies.verts[0, seat].mean(0)
-    camera = Camera(torch.tensor([[500.0, 0, 320], [0, 500.0, 180], [0, 0, 1]]),
-                    tilted(torch.tensor(0.0), torch.tensor(0.0)), 640, 360)  # fmt: skip
+    camera = replace(make_inputs().camera, R_cam_world=tilted(*torch.zeros(2)))
     bodies = replace(bodies, verts=bodies.verts - middle + torch.tensor([0.0, 0.0, -3.0]))
     objects = replace(make_inputs().objects, has_top=torch.tensor([True, True, True]))
     at = torch.tensor([[-0.1, -0.45, -3.0], [0.1, -0.7, -3.0], [0.0, -1.8, -9.0]])
@@ -217,7 +216,7 @@ def test_all_feet_together_bound_the_floor_alone():
     world = torch.tensor([[-1.0, -1.5, -2.0], [1.0, -1.3, -3.0], [0.5, -1.4, -4.0]])
     zero = torch.arange(3)
     feet = FootContacts(world @ R.mT, 0 * zero, zero, ())
-    camera = Camera(torch.tensor([[500.0, 0, 320], [0, 500.0, 180], [0, 0, 1]]), R, 640, 360)
+    camera = replace(make_inputs().camera, R_cam_world=R)
     config = AlignConfig((0.1,), float("inf"), 0.0, "sum")
     found = align_camera(AlignInputs(feet, camera, -1.4, None), config)
     assert found.ground == pytest.approx(-1.4, abs=1e-4)

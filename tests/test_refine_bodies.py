@@ -79,16 +79,14 @@ def nothing(count):
 
 def room_with(bodies, *boxes):
     """A room with boxes: size and place of the bottom's centre."""
-    pieces, proxies = [], []
-    for k, (size, place) in enumerate(boxes):
-        mesh = Mesh(box_verts(size).float(), FACES)
-        proxies.append(mesh)
-        pieces.append(
-            SceneObject(f"box_{k}", "stool", mesh, "", None, "ground", torch.tensor(place),
-                  torch.tensor(0.0), torch.ones(3))
-        )  # fmt: skip
+    proxies = tuple(Mesh(box_verts(size).float(), FACES) for size, _ in boxes)
+    pieces = [
+        SceneObject(f"box_{k}", "stool", mesh, "", None, "ground", torch.tensor(place),
+                    torch.tensor(0.0), torch.ones(3))
+        for k, (mesh, (_, place)) in enumerate(zip(proxies, boxes, strict=True))
+    ]  # fmt: skip
     scene = Scene(CAMERA, GROUND, tuple(pieces))
-    return Room(scene, scene, scene, bodies, None, tuple(proxies), (), None, {}, ())
+    return Room(scene, scene, scene, bodies, None, proxies, (), None, {}, ())
 
 
 def lowest(bodies):

@@ -10,6 +10,7 @@ from figures import ARMS_DOWN, SEATED, people, pose, turned
 from test_export import textured
 
 from mover.bodies.parts import members, parts_of
+from mover.core.records import rows_of
 from mover.core.types import Bodies, Camera, Mesh, Scene, SceneObject, SeatStretch
 from mover.furniture.library import catalogue
 from mover.geometry.placement import place_object
@@ -32,6 +33,7 @@ from mover.stages.objects.seat_heights import (
 )
 
 FLOOR = 0.0
+WEIGHTED = 1 / (1 + (0.025 / 0.07) ** 2)
 SITTERS = people(pose(SEATED, 5), fps=5.0)
 PARTS = parts_of(SITTERS)
 CARRIED = members(PARTS, "seat", "left_thigh", "right_thigh")
@@ -74,8 +76,7 @@ def seat_of(prepared: Prepared, k: int = 0) -> float:
 def test_a_seat_is_moved_to_who_sits_on_it_and_feet_and_back_stay(higher: float) -> None:
     _, prepared = furniture(higher, "chair")
     lift = find_seat_heights(asked(prepared, SITTERS))
-    weighted = 1 / (1 + (0.025 / 0.07) ** 2)
-    assert float(lift[0]) == pytest.approx(-weighted * higher, abs=0.006)
+    assert float(lift[0]) == pytest.approx(-WEIGHTED * higher, abs=0.006)
     after = with_lifted_seats(prepared, lift)
     gap = seat_of(after) - seat_of(prepared)
     assert gap == pytest.approx(float(lift[0]), abs=0.003)
@@ -99,9 +100,7 @@ def test_what_was_lifted_once_is_there_and_is_not_lifted_again() -> None:
 def test_no_people_too_few_and_a_shape_that_fits_move_nothing() -> None:
     _, prepared = furniture(0.08, "chair", "chair")
     standing = people(pose(ARMS_DOWN, 5), fps=5.0)
-    few = replace(
-        SITTERS, **{k: getattr(SITTERS, k)[:2] for k in ("verts", "frame", "person")}, pose=None
-    )
+    few = replace(rows_of(SITTERS, torch.arange(2)), pose=None)
     for inputs in (asked(prepared, SITTERS, unfit=False), asked(prepared, few),
                    asked(prepared, standing)):  # fmt: skip
         lift = find_seat_heights(inputs)
@@ -123,8 +122,7 @@ def test_lying_people_give_it_by_the_seat_alone() -> None:
     lying = replace(lying, verts=verts + torch.tensor([0.0, 1, 0]) * (seat_height(SITTERS) - low))
     _, prepared = furniture(0.08, "bed")
     lift = find_seat_heights(asked(prepared, lying))
-    weighted = 1 / (1 + (0.025 / 0.07) ** 2)
-    assert float(lift[0]) == pytest.approx(-weighted * 0.08, abs=0.012)
+    assert float(lift[0]) == pytest.approx(-WEIGHTED * 0.08, abs=0.012)
 
 
 def test_a_seat_that_is_the_top_of_its_piece_is_a_matter_of_size() -> None:

@@ -125,12 +125,10 @@ def test_touch_ignores_position_and_heading_and_headings_follow(yaw, x, z):
     R = rot_y(torch.tensor(yaw))
     moved = replace(SITTING, verts=SITTING.verts @ R.T + torch.tensor([x, 0.0, z]))
     parts = parts_of(SITTING)
-    torch.testing.assert_close(
-        touching(moved, parts, 0.0), touching(SITTING, parts, 0.0), atol=1e-3, rtol=0
-    )
-    torch.testing.assert_close(
-        headings(moved, parts)[0], R @ torch.tensor([0.0, 0, 1]), atol=0.03, rtol=0
-    )
+    found, usual = (touching(bodies, parts, 0.0) for bodies in (moved, SITTING))
+    torch.testing.assert_close(found, usual, atol=1e-3, rtol=0)
+    ahead = R @ torch.tensor([0.0, 0, 1])
+    torch.testing.assert_close(headings(moved, parts)[0], ahead, atol=0.03, rtol=0)
 
 
 def test_only_sitters_have_a_heading():

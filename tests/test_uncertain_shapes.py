@@ -17,17 +17,11 @@ from mover.stages.people.body_evidence import shape_uncertainty
 from mover.stages.people.refine_bodies import refine_bodies
 
 
-def masked(drawn: torch.Tensor) -> torch.Tensor:
-    """Two pieces, of which one fits its mask, in part hidden by the other, which does not."""
-    masks = torch.zeros(2, 10, 20, dtype=torch.bool)
+def test_a_shape_is_uncertain_as_far_as_its_outline_does_not_fit():
+    """Of two objects one fits its mask, in part hidden by the other, which does not."""
+    masks, drawn = torch.zeros(2, 10, 20, dtype=torch.bool), torch.full((10, 20), -1)
     masks[0, :, :8], masks[1, :, 8:13] = True, True
     drawn[:, :8], drawn[:, 8:18] = 0, 1
-    return masks
-
-
-def test_a_shape_is_uncertain_as_far_as_its_outline_does_not_fit():
-    drawn = torch.full((10, 20), -1)
-    masks = masked(drawn)
     share = shape_uncertainty(drawn, masks)
     assert share.tolist() == pytest.approx([0.0, 0.2 * (0.5 - 0.1)])
     drawn[:, 5:8] = 1  # what another object occludes does not count

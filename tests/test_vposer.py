@@ -83,8 +83,8 @@ def test_our_decoder_gives_the_rotations_of_the_network(both):
     torch.testing.assert_close(turns[..., 0], first, atol=1e-5, rtol=0)
     inside = (turns[..., 1] * columns[..., 1]).sum(-1)
     assert (inside > 0).all()
-    out_of_plane = (turns[..., 2] * columns[..., 1]).sum(-1)
-    torch.testing.assert_close(out_of_plane, 0 * out_of_plane, atol=1e-5, rtol=0)
+    across = (turns[..., 2] * columns[..., 1]).sum(-1)
+    torch.testing.assert_close(across, 0 * across, atol=1e-5, rtol=0)
     eye = torch.eye(3).double().expand(5, 21, 3, 3)
     torch.testing.assert_close(turns @ turns.mT, eye, atol=1e-5, rtol=0)
     assert (torch.linalg.det(turns) > 0.99).all()
@@ -119,13 +119,13 @@ def test_a_fit_with_the_learned_prior_runs_and_only_knows_its_poses(both):
 
 def test_files_that_are_not_vposer_are_refused(tmp_path):
     torch.save({"other.weight": torch.zeros(3)}, tmp_path / "a.pt")
-    with pytest.raises(InputError, match=r"a\.pt: has no 'decoder_net\.0\.weight', found other"):
-        load_vposer(tmp_path / "a.pt")
-    with pytest.raises(InputError, match="does not exist"):
-        load_vposer(tmp_path / "none.pt")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="expected VPoser's snapshots"):
-        load_vposer(tmp_path / "empty")
     torch.save(First(), tmp_path / "whole.pt")  # a pickled object, which would run code
-    with pytest.raises(InputError, match="cannot be read as plain weights"):
-        load_vposer(tmp_path / "whole.pt")
+    for name, words in (
+        ("a.pt", r"a\.pt: has no 'decoder_net\.0\.weight', found other"),
+        ("none.pt", "does not exist"),
+        ("empty", "expected VPoser's snapshots"),
+        ("whole.pt", "cannot be read as plain weights"),
+    ):
+        with pytest.raises(InputError, match=words):
+            load_vposer(tmp_path / name)

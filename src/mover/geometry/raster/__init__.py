@@ -77,8 +77,6 @@ def layers(
     `exit` is the nearest back-facing surface. Where a body cuts into itself (a hand in the hip) the
     ray may still be inside another part there: the bound is conservative, never too deep.
     """
-    if reference := _reference_of(verts_cam):
-        return reference.layers(verts_cam, faces, views)
     points = verts_cam.detach().float().cpu()
     size = (len(points), views.height, views.width)
     most = max(1, MOST // max(views.height * views.width, points.shape[1], 1))
@@ -103,8 +101,6 @@ def first_hit(
 
     The size is height and width [px]; triangles need not be closed or consistent.
     """
-    if reference := _reference_of(verts_cam):
-        return reference.first_hit(verts_cam, faces, K, size)
     depth, face = torch.full(size, torch.inf), torch.full(size, -1, dtype=torch.int32)
     if len(verts_cam):
         shape, views = Topology(faces[None], faces.new_zeros(1, 0, 4)), Crops(K[None], *size)
