@@ -48,20 +48,14 @@ def moved(item: SceneObject, *shift: float) -> SceneObject:
 
 def room() -> Scene:
     """A chair, a table and a rug without thickness before the camera."""
-    rug = Mesh(
-        cuboid(1, 1, 1).verts * torch.tensor([1.5, 0, 1.0], dtype=F64), cuboid(1, 1, 1).faces
+    cube = cuboid(1, 1, 1)
+    rug = Mesh(cube.verts * torch.tensor([1.5, 0, 1.0], dtype=F64), cube.faces)
+    pieces = (
+        piece(cuboid(0.5, 0.9, 0.5), (-0.6, GROUND, -2.5), 0.4, "chair"),
+        piece(cuboid(1.2, 0.7, 0.8), (0.8, GROUND, -3), -0.2, "table"),
+        piece(rug, (0, GROUND, -3), 0.1, "rug"),
     )
-    return Scene(
-        CAMERA,
-        GROUND,
-        (
-            piece(cuboid(0.5, 0.9, 0.5), (-0.6, GROUND, -2.5), 0.4, "chair"),
-            replace(
-                piece(cuboid(1.2, 0.7, 0.8), (0.8, GROUND, -3), -0.2, "table"), category="table"
-            ),
-            replace(piece(rug, (0, GROUND, -3), 0.1, "rug"), category="rug"),
-        ),
-    )
+    return Scene(CAMERA, GROUND, tuple(replace(one, category=one.id) for one in pieces))
 
 
 def people(frames: int = 3, detail: Literal["small", "full"] = "small") -> Bodies:

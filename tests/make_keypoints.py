@@ -13,12 +13,8 @@ from mover.geometry.camera import project, tilted
 from mover.geometry.rotations import rot_y
 
 WIDTH, HEIGHT = 960, 540
-CAMERA = Camera(
-    torch.tensor([[760.0, 0, 470], [0, 770, 280], [0, 0, 1]]),
-    tilted(torch.tensor(-0.15), torch.tensor(0.03)),
-    WIDTH,
-    HEIGHT,
-)
+K = torch.tensor([[760.0, 0, 470], [0, 770, 280], [0, 0, 1]])
+CAMERA = Camera(K, tilted(torch.tensor(-0.15), torch.tensor(0.03)), WIDTH, HEIGHT)
 
 
 def walker(frames=12, fps=5.0, yaw=0.6, model=None, tall=0.8) -> tuple[BodyPose, torch.Tensor]:
@@ -54,9 +50,8 @@ def as_bodies(pose: BodyPose, frame: torch.Tensor, fps: float | None = 5.0, pers
     model = open_body()
     verts, joints = model.posed(pose)
     who = torch.full_like(frame, person)
-    return Bodies(
-        verts, model.faces, joints, model.joint_names, frame, who, fps, "camera", pose
-    )  # fmt: skip
+    names = model.joint_names
+    return Bodies(verts, model.faces, joints, names, frame, who, fps, "camera", pose)
 
 
 def seen(bodies: Bodies, layout="openpose25", noise=0.0, missing=0.0, seed=0) -> Keypoints:
@@ -67,11 +62,8 @@ def seen(bodies: Bodies, layout="openpose25", noise=0.0, missing=0.0, seed=0) ->
     pixels = pixels + torch.from_numpy(noise * rng.normal(size=pixels.shape)).float()
     there = torch.from_numpy(rng.uniform(size=pixels.shape[:2]) >= missing)
     there = there & spots_of(open_body(), layout).there
-    sure = there.float()
-    return Keypoints(
-        torch.where(there[..., None], pixels, torch.zeros_like(pixels)),
-        sure, layout, bodies.frame, bodies.person, bodies.fps,
-    )  # fmt: skip
+    shown = torch.where(there[..., None], pixels, torch.zeros_like(pixels))
+    return Keypoints(shown, there.float(), layout, bodies.frame, bodies.person, bodies.fps)
 
 
 def leg_columns(layout="openpose25") -> list[int]:

@@ -9,6 +9,7 @@ import json
 import math
 import pickle
 from collections import defaultdict
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,7 @@ BODY = {  # rest place of the joints [m]; +x is the person's left, +y up, +z whe
     20: (0.68, 0.21, -0.04), 21: (-0.68, 0.21, -0.04),
 }  # fmt: skip
 PARENTS = [-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19]
-COUNTS = {"smpl": (24, 6890), "smplh": (52, 6890), "smplx": (55, 10475)}
+COUNTS = {"smpl": (24, 690), "smplh": (52, 690), "smplx": (55, 1100)}  # joints; a tenth of the skin
 HAND_MEAN = 0.2  # [rad], what SMPL-X adds to every angle of a hand
 
 
@@ -175,8 +176,7 @@ def write_gvhmr(folder: Path, names=("smpl_params_incam", "smpl_params_global"))
     return folder / "hmr4d_results.pt"
 
 
-def write_gem(folder: Path) -> Path:
-    return write_gvhmr(folder, ("body_params_incam", "body_params_global"))
+write_gem = partial(write_gvhmr, names=("body_params_incam", "body_params_global"))
 
 
 def to_torch(value):
@@ -206,9 +206,7 @@ def wham_person() -> dict:
 
 
 def write_wham(folder: Path) -> Path:
-    results = defaultdict(dict)
-    results[TRACK] = wham_person()
-    return dump(results, folder / "wham_output.pkl")
+    return dump(defaultdict(dict, {TRACK: wham_person()}), folder / "wham_output.pkl")
 
 
 def pare_person() -> dict:
@@ -231,12 +229,8 @@ def pare_person() -> dict:
     }  # fmt: skip
 
 
-def write_pare(folder: Path) -> Path:
-    return dump({TRACK: pare_person()}, folder / "pare_output.pkl")
-
-
-def write_vibe(folder: Path) -> Path:
-    return dump({TRACK: pare_person()}, folder / "vibe_output.pkl")
+def write_pare(folder: Path, name="pare_output.pkl") -> Path:
+    return dump({TRACK: pare_person()}, folder / name)
 
 
 def write_pare_images(folder: Path) -> Path:
@@ -255,16 +249,13 @@ def write_phalp(folder: Path) -> Path:
     turns = matrices(true["angles"])
     frames = {}
     for frame in range(int(FRAMES[-1]) + 1):
-        row = {"time": frame, "tid": [], "smpl": [], "camera": [], "size": [], "tracked_time": []}
         near = int(np.argmin(np.abs(FRAMES - frame)))
         ghost = frame not in FRAMES  # the tracker foretells people that it does not see
         body = {"global_orient": turns[near, :1], "body_pose": turns[near, 1:]}
-        row["smpl"].append({**body, "betas": true["betas"][near]})
-        row["tid"].append(TRACK)
-        row["camera"].append(place[near])
-        row["size"].append([HEIGHT, WIDTH])
-        row["tracked_time"].append(int(ghost))
-        frames[f"outputs/_DEMO/video/img/{frame + 1:06d}.jpg"] = row
+        frames[f"outputs/_DEMO/video/img/{frame + 1:06d}.jpg"] = {
+            "time": frame, "tid": [TRACK], "smpl": [{**body, "betas": true["betas"][near]}],
+            "camera": [place[near]], "size": [[HEIGHT, WIDTH]], "tracked_time": [int(ghost)],
+        }  # fmt: skip
     return dump(frames, folder / "demo_video.pkl", compress=3)
 
 
@@ -345,18 +336,14 @@ def write_sam3dbody(folder: Path, focal=True) -> Path:
     for k, frame in enumerate(FRAMES):
         people = []
         for far in (0.0, 1.5):
-            at = true["transl"][0 if far else k] + [far, 0, far]
-            verts = true["verts"][0 if far else k] + at - true["transl"][0 if far else k]
-            joints = true["joints"][0 if far else k] + at - true["transl"][0 if far else k]
+            verts, joints = (true[n][0 if far else k] + [far, 0, far] for n in ("verts", "joints"))
             shift = under(used, {"verts": verts[None]})[0]
-            one = {
+            people.append({
                 "pred_vertices": (verts + shift - place).astype(np.float32), "pred_cam_t": place,
                 "pred_keypoints_3d": joints + shift - place,
                 "pred_keypoints_2d": pixels(joints + shift, used), "bbox": np.zeros(4),
-            }  # fmt: skip
-            if focal:
-                one["focal_length"] = 1400.0
-            people.append(one)
+                **({"focal_length": 1400.0} if focal else {}),
+            })  # fmt: skip
         for j, one in enumerate(people if k % 2 else people[::-1]):
             np.savez(folder / f"{frame:06d}_subj{j:02d}.npz", **one)
     return folder
@@ -382,8 +369,7 @@ def write_amass(folder: Path, model="smplh") -> Path:
     return folder / "walk_poses.npz"
 
 
-def write_amass_x(folder: Path) -> Path:
-    return write_amass(folder, "smplx")
+write_amass_x = partial(write_amass, model="smplx")
 
 
 def smplx_parts(k: int) -> dict:
@@ -431,7 +417,8 @@ BODIES = {
     "gvhmr": write_gvhmr, "pare": write_pare, "pare:images": write_pare_images,
     "phalp": write_phalp, "prompthmr": write_prompthmr,
     "prox": write_prox, "sam3dbody": write_sam3dbody, "slahmr": write_slahmr,
-    "smplifyx": write_smplifyx, "tram": write_tram, "vibe": write_vibe, "wham": write_wham,
+    "smplifyx": write_smplifyx, "tram": write_tram,
+    "vibe": partial(write_pare, name="vibe_output.pkl"), "wham": write_wham,
 }  # fmt: skip
 
 # The joints of the skeleton that show where a detector's points are.
@@ -464,8 +451,7 @@ def seen(names) -> np.ndarray:
     found = np.zeros((len(FRAMES), len(names), 3))
     for k, name in enumerate(names):
         if name in SHOWN:
-            found[:, k, :2] = shown[:, SHOWN[name]]
-            found[:, k, 2] = 0.9
+            found[:, k] = np.c_[shown[:, SHOWN[name]], np.full(len(FRAMES), 0.9)]
     return found
 
 
@@ -475,46 +461,26 @@ def write_openpose(folder: Path) -> Path:
     left, right = hand.copy(), hand.copy()
     left[:, 0], right[:, 0] = body[:, 7], body[:, 4]
     for frame in range(int(FRAMES[-1]) + 1):
-        people = []
-        if frame in FRAMES:
-            k = int(np.flatnonzero(frame == FRAMES)[0])
-            people = [{
-                "person_id": [-1], "pose_keypoints_2d": body[k].ravel().tolist(),
-                "hand_left_keypoints_2d": left[k].ravel().tolist(),
-                "hand_right_keypoints_2d": right[k].ravel().tolist(),
-                "face_keypoints_2d": [0.0] * 210, "pose_keypoints_3d": [],
-            }]  # fmt: skip
+        people = [{
+            "person_id": [-1], "pose_keypoints_2d": body[k].ravel().tolist(),
+            "hand_left_keypoints_2d": left[k].ravel().tolist(),
+            "hand_right_keypoints_2d": right[k].ravel().tolist(),
+            "face_keypoints_2d": [0.0] * 210, "pose_keypoints_3d": [],
+        } for k in np.flatnonzero(frame == FRAMES)]  # fmt: skip
         text = json.dumps({"version": 1.3, "people": people})
         (folder / f"video_{frame:012d}_keypoints.json").write_text(text)
     return folder
 
 
-def write_halpe26(folder: Path) -> Path:
+def write_coco17(folder: Path, name="results.json", joints=COCO, **more) -> Path:
+    """A row a person and frame, as COCO's results; `more` are further fields of each."""
     rows = [
-        {"image_id": f"{f}.jpg", "category_id": 1, "keypoints": row.ravel().tolist(),
-         "score": 2.9, "box": [0, 0, 1, 1], "idx": TRACK}
-        for f, row in zip(FRAMES, seen(HALPE), strict=True)
+        {"image_id": f"{f}.jpg" if more else int(f), "category_id": 1,
+         "keypoints": row.ravel().tolist(), "score": 0.8, **more}
+        for f, row in zip(FRAMES, seen(joints), strict=True)
     ]  # fmt: skip
-    (folder / "alphapose-results.json").write_text(json.dumps(rows))
-    return folder / "alphapose-results.json"
-
-
-def write_coco17(folder: Path) -> Path:
-    rows = [
-        {"image_id": int(f), "category_id": 1, "keypoints": row.ravel().tolist(), "score": 0.8}
-        for f, row in zip(FRAMES, seen(COCO), strict=True)
-    ]
-    (folder / "results.json").write_text(json.dumps(rows))
-    return folder / "results.json"
-
-
-def write_mediapipe(folder: Path) -> Path:
-    rows = [
-        {"image_id": int(f), "category_id": 1, "keypoints": row.ravel().tolist(), "score": 0.8}
-        for f, row in zip(FRAMES, seen(MEDIAPIPE), strict=True)
-    ]
-    (folder / "landmarks.json").write_text(json.dumps(rows))
-    return folder / "landmarks.json"
+    (folder / name).write_text(json.dumps(rows))
+    return folder / name
 
 
 def write_coco17_mmpose(folder: Path) -> Path:
@@ -530,5 +496,8 @@ def write_coco17_mmpose(folder: Path) -> Path:
 
 KEYPOINTS = {
     "coco17": write_coco17, "coco17:mmpose": write_coco17_mmpose,
-    "halpe26": write_halpe26, "openpose": write_openpose, "mediapipe": write_mediapipe,
+    "halpe26": partial(write_coco17, name="alphapose-results.json", joints=HALPE, score=2.9,
+                       box=[0, 0, 1, 1], idx=TRACK),
+    "openpose": write_openpose,
+    "mediapipe": partial(write_coco17, name="landmarks.json", joints=MEDIAPIPE),
 }  # fmt: skip

@@ -11,6 +11,7 @@ from pathlib import Path
 import make_people as made
 import make_scenes as layouts
 import numpy as np
+import tiny_capture as tiny
 import torch
 from make_smpl import make_model, write_npz
 from PIL import Image
@@ -117,12 +118,12 @@ def write_object_masks(path: Path, plain: layouts.Room, room: KnownRoom) -> Path
         assert found.mask is not None
         mask = decode(found.mask, 0).numpy()
         factor = SIZE[0] // mask.shape[1]
-        runs = layouts.runs_of(np.kron(mask, np.ones((factor, factor), dtype=bool)))
+        runs = tiny.runs(np.kron(mask, np.ones((factor, factor), dtype=bool)))
         left, top, right, bottom = plain.box2d(thing)
         rows.append({
             "id": i, "image_id": 0, "category_id": names.index(thing.category),
             "bbox": [left, top, right - left, bottom - top],
-            "segmentation": {"size": [SIZE[1], SIZE[0]], "counts": layouts.compressed(runs)},
+            "segmentation": {"size": [SIZE[1], SIZE[0]], "counts": tiny.compressed(runs)},
         })  # fmt: skip
     image = {"id": 0, "width": SIZE[0], "height": SIZE[1], "file_name": "000000.jpg"}
     categories = [{"id": i, "name": name} for i, name in enumerate(names)]

@@ -4,7 +4,10 @@ A room is plain: `Room(K, R, size, ground, things)`, the world has +y up and the
 origin, x_cam = R @ x_world (x right, y down, z forward).
 """
 
+import io
 import json
+import zipfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,12 +17,14 @@ import trimesh
 from PIL import Image
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation
+from tiny_capture import compressed, runs, write_obj
 
 NYU40 = {
     "bed": 4, "chair": 5, "sofa": 6, "table": 7, "desk": 14, "shelves": 15, "cabinet": 3,
     "night_stand": 32, "lamp": 35, "bookshelf": 10, "otherfurniture": 39,
 }  # fmt: skip
 FLIP = np.diag([1.0, -1.0, -1.0])
+Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # our world -> one with z up
 
 
 @dataclass
@@ -37,6 +42,16 @@ class Thing:
     @property
     def world(self) -> np.ndarray:
         return (self.verts * self.scale) @ about_y(self.yaw).T + self.t
+
+    @property
+    def size(self) -> np.ndarray:
+        return self.scale * np.ptp(self.verts, axis=0)
+
+    @property
+    def centre(self) -> np.ndarray:
+        """Middle of its box in the world."""
+        middle = (self.verts.min(0) + self.verts.max(0)) / 2
+        return about_y(self.yaw) @ (self.scale * middle) + self.t
 
 
 @dataclass
@@ -58,19 +73,18 @@ def about_y(a: float) -> np.ndarray:
     return np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
 
 
+def four(R: np.ndarray, t: Any = (0, 0, 0)) -> np.ndarray:
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = R, t
+    return out
+
+
 def picture(size: tuple[int, int]) -> Image.Image:
     """A picture whose left half is darker."""
     pixels = np.zeros((size[1], size[0], 3), dtype=np.uint8)
     pixels[:, size[0] // 2 :, 0] = 200
     pixels[: size[1] // 2, :, 1] = 90
     return Image.fromarray(pixels)
-
-
-def write_obj(path: Path, verts: np.ndarray, faces: np.ndarray) -> None:
-    lines = ["v " + " ".join(repr(float(x)) for x in v) for v in verts]
-    lines += ["f " + " ".join(str(int(i) + 1) for i in f) for f in faces]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text("\n".join(lines) + "\n")
 
 
 def mesh(verts: np.ndarray, faces: np.ndarray) -> trimesh.Trimesh:
@@ -101,21 +115,15 @@ def write_total3d(folder: Path, room: Room, *, flat: bool = False, kind: str = "
     cells = np.empty((1, len(room.things)), dtype=object)
     for i, t in enumerate(room.things):
         low, high = t.verts.min(0), t.verts.max(0)
-        centre = about_y(t.yaw) @ (t.scale * (low + high) / 2) + t.t
-        # Rows of basis: the box's own x, y, z (front) in Total3D's world.
-        basis = (OURS_TO_T3D @ about_y(t.yaw)).T
-        cells[0, i] = {
-            "basis": basis.astype("f4"),
-            "coeffs": (t.scale * (high - low) / 2)[None].astype("f4"),
-            "centroid": (OURS_TO_T3D @ centre)[None].astype("f4"),
+        cells[0, i] = {  # rows of basis: the box's own x, y, z (front) in Total3D's world
+            "basis": (OURS_TO_T3D @ about_y(t.yaw)).T.astype("f4"),
+            "coeffs": (t.size / 2)[None].astype("f4"),
+            "centroid": (OURS_TO_T3D @ t.centre)[None].astype("f4"),
             "classid": np.array([[NYU40[t.category]]]),
         }
         unit = (t.verts - (low + high) / 2) / ((high - low) / 2)
         path = result / f"{i}_{NYU40[t.category]}.{kind}"
-        if kind == "obj":
-            write_obj(path, unit, t.faces)
-        else:
-            mesh(unit, t.faces).export(path)
+        write_obj(path, unit, t.faces) if kind == "obj" else mesh(unit, t.faces).export(path)
     ids = np.array([[NYU40[t.category] for t in room.things]])
     savemat(result / "bdb_3d.mat", {"bdb": cells, "class_id": ids})
     return folder
@@ -127,20 +135,13 @@ def write_sam3d(folder: Path, room: Room, *, kind: str = "npz") -> Path:
     folder.mkdir(parents=True)
     to_p3d = np.diag([-1.0, -1.0, 1.0])
     for i, t in enumerate(room.things):
-        verts = t.verts * t.scale
-        size = float(np.ptp(verts, axis=0).max())
-        stored = verts / size
-        mesh(stored, t.faces).export(folder / f"{i}.glb")
+        size = float(t.size.max())
+        mesh(t.verts * t.scale / size, t.faces).export(folder / f"{i}.glb")
         # local = (x, -z, y) of the stored ones; p3d = (local * s) @ M + t
         A = to_p3d @ room.R @ about_y(t.yaw)  # p3d from y-up
-        local_to_yup = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-        M = (A @ local_to_yup).T
-        x, y, z, w = Rotation.from_matrix(M).as_quat()
-        pose: dict[str, Any] = {
-            "rotation": np.array([[w, x, y, z]]),
-            "translation": (to_p3d @ room.R @ t.t)[None],
-            "scale": np.full((1, 3), size),
-        }
+        x, y, z, w = Rotation.from_matrix((A @ Z_UP.T).T).as_quat()
+        pose = {"rotation": np.array([[w, x, y, z]]), "scale": np.full((1, 3), size),
+                "translation": (to_p3d @ room.R @ t.t)[None]}  # fmt: skip
         if kind == "npz":
             np.savez(folder / f"{i}.npz", **pose, category=np.array(t.category))
         else:
@@ -160,13 +161,10 @@ def write_holisticmesh(folder: Path, room: Room) -> Path:
         own = t.world @ room.R.T
         verts.append(np.concatenate([own, np.repeat(own[-1:], size - len(own), 0)]))
         faces.append(t.faces + i * size)
-    whole = mesh(np.concatenate(verts), np.concatenate(faces))
-    whole.export(folder / "models" / "scene.ply")
-    rows = []
-    for t in room.things:
-        left, top, right, bottom = room.box2d(t)
-        box = [room.size[0] - right, top, room.size[0] - left, bottom]
-        rows.append({"bbox": box, "class": t.category})
+    mesh(np.concatenate(verts), np.concatenate(faces)).export(folder / "models" / "scene.ply")
+    width, boxes = room.size[0], [(*room.box2d(t), t.category) for t in room.things]
+    rows = [{"bbox": [width - right, top, width - left, bottom], "class": category}
+            for left, top, right, bottom, category in boxes]  # fmt: skip
     (folder / "detections.json").write_text(json.dumps(rows))
     return folder
 
@@ -177,58 +175,57 @@ def write_glb(path: Path, room: Room, world: np.ndarray | None = None, camera: b
     world = np.eye(4) if world is None else world
     scene = trimesh.Scene()
     for t in room.things:
-        matrix = np.eye(4)
-        matrix[:3, :3] = about_y(t.yaw) @ np.diag(t.scale)
-        matrix[:3, 3] = t.t
-        scene.add_geometry(mesh(t.verts, t.faces), node_name=t.name, transform=world @ matrix)
+        matrix = world @ four(about_y(t.yaw) @ np.diag(t.scale), t.t)
+        scene.add_geometry(mesh(t.verts, t.faces), node_name=t.name, transform=matrix)
     content = scene.export(file_type="glb")
     if camera:
-        pose = np.eye(4)
-        pose[:3, :3] = room.R.T @ FLIP
-        content = with_camera(content, world @ pose, room)
+        content = with_camera(content, world @ four(room.R.T @ FLIP), room)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(content)
     return path
 
 
 def with_camera(content: bytes, pose: np.ndarray, room: Room) -> bytes:
-    """A camera node in the JSON chunk of a .glb."""
-    size = int.from_bytes(content[12:16], "little")
-    tree = json.loads(content[20 : 20 + size])
     fy, fx, (w, h) = room.K[1, 1], room.K[0, 0], room.size
     lens = {"yfov": 2 * np.arctan(h / 2 / fy), "aspectRatio": (w / fx) / (h / fy), "znear": 0.1}
-    tree["cameras"] = [{"type": "perspective", "perspective": lens}]
-    tree["nodes"].append({"name": "camera", "camera": 0, "matrix": pose.T.ravel().tolist()})
-    tree["scenes"][tree.get("scene", 0)]["nodes"].append(len(tree["nodes"]) - 1)
+
+    def add(tree: dict[str, Any]) -> None:
+        tree["cameras"] = [{"type": "perspective", "perspective": lens}]
+        tree["nodes"].append({"name": "camera", "camera": 0, "matrix": pose.T.ravel().tolist()})
+        tree["scenes"][tree.get("scene", 0)]["nodes"].append(len(tree["nodes"]) - 1)
+
+    return with_json(content, add)
+
+
+def with_json(content: bytes, change: Callable[[dict[str, Any]], None]) -> bytes:
+    """A .glb whose JSON chunk is changed."""
+    size = int.from_bytes(content[12:16], "little")
+    tree = json.loads(content[20 : 20 + size])
+    change(tree)
     chunk = json.dumps(tree).encode()
     chunk += b" " * (-len(chunk) % 4)
     body = content[20 + size :]
-    head = len(chunk).to_bytes(4, "little") + b"JSON"
-    total = (12 + 8 + len(chunk) + len(body)).to_bytes(4, "little")
-    return content[:8] + total + head + chunk + body
+    total, length = ((n + len(chunk)).to_bytes(4, "little") for n in (20 + len(body), 0))
+    return content[:8] + total + length + b"JSON" + chunk + body
+
+
+def camera_json(room: Room) -> dict[str, Any]:
+    (w, h), K = room.size, room.K
+    return {"w": w, "h": h, "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2],
+            "R_cam_world": room.R.tolist()}  # fmt: skip
 
 
 # --- boxes ---
 def write_boxes(path: Path, room: Room, *, frame: str = "y") -> Path:
     """Boxes in a world with y up, -y up or z up, or in the camera's axes."""
-    worlds = {
-        "y": np.eye(3), "-y": FLIP, "z": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
-        "camera": room.R,
-    }  # fmt: skip
-    turn = worlds[frame]
-    rows = []
-    for t in room.things:
-        low, high = t.verts.min(0), t.verts.max(0)
-        centre = about_y(t.yaw) @ (t.scale * (low + high) / 2) + t.t
-        rows.append({
-            "id": t.name, "category": t.category, "center": (turn @ centre).tolist(),
-            "size": (t.scale * (high - low)).tolist(), "box2d": room.box2d(t), "score": 0.9,
-            "rotation": (turn @ about_y(t.yaw)).tolist(),
-        })  # fmt: skip
-    w, h = room.size
-    camera = {"w": w, "h": h, "fl_x": room.K[0, 0], "fl_y": room.K[1, 1], "cx": room.K[0, 2],
-              "cy": room.K[1, 2], "R_cam_world": room.R.tolist()}  # fmt: skip
-    tree = {"camera": camera, "ground": room.ground, "objects": rows}
+    turn = {"y": np.eye(3), "-y": FLIP, "z": Z_UP, "camera": room.R}[frame]
+    rows = [
+        {"id": t.name, "category": t.category, "center": (turn @ t.centre).tolist(),
+         "size": t.size.tolist(), "box2d": room.box2d(t), "score": 0.9,
+         "rotation": (turn @ about_y(t.yaw)).tolist()}
+        for t in room.things
+    ]  # fmt: skip
+    tree = {"camera": camera_json(room), "ground": room.ground, "objects": rows}
     tree |= {"frame": "camera"} if frame == "camera" else {"frame": "world", "up": frame}
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(tree))
@@ -246,14 +243,12 @@ def write_release(folder: Path, room: Room, bodies: np.ndarray, faces: np.ndarra
     write_xml(st2 / "smplifyx_cam" / "001.xml", room.K - HALF, R_down)
     posa = folder / "smplifyx_results_st0" / "results" / "posa_contact_npy_newBottom"
     posa.mkdir(parents=True)
-    for i in range(len(bodies)):
-        np.save(
-            posa / f"{i:06d}_sample_00.npy", np.full((bodies.shape[1], 1), 0.25 * (i % 4), "f4")
-        )
     frames = folder / "Color_flip_rename"
     frames.mkdir()
     w, h = room.size
     for i in range(len(bodies)):
+        chance = np.full((bodies.shape[1], 1), 0.25 * (i % 4), "f4")
+        np.save(posa / f"{i:06d}_sample_00.npy", chance)
         picture(room.size).save(frames / f"{i + 1:06d}.jpg")
         home = folder / "Color_flip_rename_pointrend_X_101_det_all" / f"{i + 1:06d}"
         home.mkdir(parents=True)
@@ -289,40 +284,26 @@ def write_truth(folder: Path, room: Room, *, columns: bool = False) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     tree = {}
     for t in room.things:
-        low, high = t.verts.min(0), t.verts.max(0)
-        centre = about_y(t.yaw) @ (t.scale * (low + high) / 2) + t.t
         axes = (room.R @ about_y(t.yaw)).T  # rows
         tree[t.name] = {
-            "centroid": (room.R @ centre).tolist(),
-            "coeffs": (t.scale * (high - low) / 2).tolist(),
+            "centroid": (room.R @ t.centre).tolist(), "coeffs": (t.size / 2).tolist(),
             "basis": (axes.T if columns else axes).tolist(),
-        }
+        }  # fmt: skip
     (folder / "bbox3d.json").write_text(json.dumps(tree))
-    scan(room).apply_transform(_four(room.R)).export(folder / "scan_cam_cooridnates.ply")
+    scan(room).apply_transform(four(room.R)).export(folder / "scan_cam_cooridnates.ply")
 
 
 def scan(room: Room) -> trimesh.Trimesh:
     """Everything and a floor, in our world."""
     grid = np.stack(np.meshgrid(np.arange(-4, 4, 0.2), np.arange(-8, 0, 0.2)), -1).reshape(-1, 2)
-    n = 40
-    cells = [
-        (i * n + j, i * n + j + 1, (i + 1) * n + j) for i in range(n - 1) for j in range(n - 1)
-    ]
+    corner = (np.arange(39)[:, None] * 40 + np.arange(39)).ravel()
+    cells = corner[:, None] + [0, 1, 40]
     floor = np.stack([grid[:, 0], np.full(len(grid), room.ground), grid[:, 1]], 1)
-    parts = [mesh(t.world, t.faces) for t in room.things] + [mesh(floor, np.array(cells))]
+    parts = [mesh(t.world, t.faces) for t in room.things] + [mesh(floor, cells)]
     return trimesh.util.concatenate(parts)
 
 
-def _four(R: np.ndarray) -> np.ndarray:
-    out = np.eye(4)
-    out[:3, :3] = R
-    return out
-
-
 # --- PROX ---
-Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # our world -> the scan's, z up
-
-
 def prox_stem(recording: str, index: int) -> str:
     """Name of a frame: stills of the quantitative part are each the first frame of their own shot.
 
@@ -353,12 +334,9 @@ def write_prox(root: Path, room: Room, recording: str, frames: int, shift: np.nd
         (root / name).mkdir(parents=True, exist_ok=True)
     lens = {"camera_mtx": (room.K - HALF).tolist(), "k": [0.1, 0.0, 0.0, 0.0, 0.0]}
     (root / "calibration" / "Color.json").write_text(json.dumps(lens))
-    cam2world = _four(Z_UP @ room.R.T)
-    cam2world[:3, 3] = shift
+    cam2world = four(Z_UP @ room.R.T, shift)
     (root / "cam2world" / f"{place}.json").write_text(json.dumps(cam2world.tolist()))
-    matrix = _four(Z_UP)
-    matrix[:3, 3] = shift
-    scan(room).apply_transform(matrix).export(root / "scenes" / f"{place}.ply")
+    scan(room).apply_transform(four(Z_UP, shift)).export(root / "scenes" / f"{place}.ply")
     color = root / "recordings" / recording / "Color"
     keypoints = root / "keypoints" / recording
     index = root / "recordings" / recording / "BodyIndexColor"
@@ -383,70 +361,37 @@ def write_prox(root: Path, room: Room, recording: str, frames: int, shift: np.nd
 def write_pigraphs(root: Path, room: Room, name: str, joints: np.ndarray, *, mirror: bool) -> Path:
     """Joints (frames, 25, 3) in the camera's axes; Kinect's x is left, or right if `mirror`."""
     root.mkdir(parents=True, exist_ok=True)
-    place = name.split("_")[0]
+    place, shift = name.split("_")[0], [1.0, 2.0, 1.5]
     kinect = np.diag([1.0, -1, 1]) if mirror else np.diag([-1.0, -1, 1])  # from x right, y down
-    scan_cam = _four(Z_UP @ room.R.T @ kinect)
-    scan_cam[:3, 3] = [1.0, 2.0, 1.5]
-    rows = [
-        {"trackingId": 72057594037928000 + 1, "timestamp": 1000 + 200 * i,
-         "jointPositions": (pose @ kinect).tolist()}
-        for i, pose in enumerate(joints)
-    ]  # fmt: skip
+    scan_cam = four(Z_UP @ room.R.T @ kinect, shift)
     times = [1000 + 200 * i for i in range(len(joints))]
+    rows = [{"trackingId": 72057594037928000 + 1, "timestamp": time,
+             "jointPositions": (pose @ kinect).tolist()}
+            for time, pose in zip(times, joints, strict=True)]  # fmt: skip
     tree = {"id": name, "camera": scan_cam.ravel().tolist(), "depthTimestamps": times,
             "skeletons": rows}  # fmt: skip
     (root / f"{name}.json").write_text(json.dumps(tree))
     groups = []
     for i, t in enumerate(room.things):
-        low, high = t.verts.min(0), t.verts.max(0)
-        centre = about_y(t.yaw) @ (t.scale * (low + high) / 2) + t.t
-        size = t.scale * (high - low)
         axes = (Z_UP @ about_y(t.yaw)).T
-        # Two parts: the lower and the upper half.
-        for part, sign in (("base", -1), ("top", 1)):
-            middle = centre + np.array([0, sign * size[1] / 4, 0])
-            lengths = size * [1, 0.5, 1]
+        for part, sign in (("base", -1), ("top", 1)):  # the lower and the upper half
+            middle = t.centre + np.array([0, sign * t.size[1] / 4, 0])
             groups.append({
                 "id": len(groups), "label": f"{t.category}:{part}", "objectId": i,
                 "dominantNormal": [0, 0, 1], "segments": [],
-                "obb": {"centroid": (Z_UP @ middle + [1.0, 2.0, 1.5]).tolist(),
-                        "axesLengths": lengths.tolist(),
+                "obb": {"centroid": (Z_UP @ middle + shift).tolist(),
+                        "axesLengths": (t.size * [1, 0.5, 1]).tolist(),
                         "normalizedAxes": axes.ravel().tolist()},
             })  # fmt: skip
     wall = {"centroid": [0, 0, 0], "axesLengths": [1, 1, 1], "normalizedAxes": [1, 0, 0, 0, 1, 0,
             0, 0, 1]}  # fmt: skip
     groups.append({"id": 999, "label": "wall", "objectId": 999, "obb": wall, "segments": []})
     (root / f"{place}d.segs.json").write_text(json.dumps({"segGroups": groups}))
-    matrix = _four(Z_UP)
-    matrix[:3, 3] = [1.0, 2.0, 1.5]
-    scan(room).apply_transform(matrix).export(root / f"{place}.ply")
+    scan(room).apply_transform(four(Z_UP, shift)).export(root / f"{place}.ply")
     return root
 
 
 # --- masks ---
-def runs_of(mask: np.ndarray) -> list[int]:
-    """Run lengths down the columns, background first."""
-    flat = np.concatenate([[0], mask.T.ravel().astype(int), [0]])
-    edges = np.flatnonzero(np.diff(flat))
-    ends = np.concatenate([[0], edges, [mask.size]]) if len(edges) else np.array([0, mask.size])
-    counts = np.diff(ends).tolist()
-    return counts[:-1] if counts and counts[-1] == 0 and len(counts) > 1 else counts
-
-
-def compressed(counts: list[int]) -> str:
-    """COCO's code of run lengths: five bits a character, differences to the run two before."""
-    code = ""
-    for i, count in enumerate(counts):
-        x = count - (counts[i - 2] if i > 2 else 0)
-        more = True
-        while more:
-            bits = x & 31
-            x >>= 5
-            more = x != (-1 if bits & 16 else 0)
-            code += chr(bits + (32 if more else 0) + 48)
-    return code
-
-
 def write_masks(folder: Path, masks: np.ndarray, names: list[str]) -> dict[str, Path]:
     """The same masks (n, h, w), which do not overlap, in every layout."""
     folder.mkdir(parents=True)
@@ -465,8 +410,8 @@ def write_masks(folder: Path, masks: np.ndarray, names: list[str]) -> dict[str, 
         out[key].write_text(json.dumps(tree))
 
     codes = {
-        "coco_list": lambda m: {"size": [h, w], "counts": runs_of(m)},
-        "coco_text": lambda m: {"size": [h, w], "counts": compressed(runs_of(m))},
+        "coco_list": lambda m: {"size": [h, w], "counts": runs(m)},
+        "coco_text": lambda m: {"size": [h, w], "counts": compressed(runs(m))},
     }
     for key, code in codes.items():
         rows = [
@@ -480,7 +425,7 @@ def write_masks(folder: Path, masks: np.ndarray, names: list[str]) -> dict[str, 
     for key, table in (("results", coco), ("detectron2", order)):
         save(key, f"{key}.json", [
             {"image_id": 3, "category_id": table[names[i]], "score": 0.5, "bbox": [0, 0, 1, 1],
-             "segmentation": {"size": [h, w], "counts": compressed(runs_of(m))}}
+             "segmentation": {"size": [h, w], "counts": compressed(runs(m))}}
             for i, m in enumerate(masks)
         ])  # fmt: skip
     save("mover", "mover.json", [
@@ -546,11 +491,14 @@ def write_bomb(path: Path, mark: Path) -> Path:
 
 def write_zip_bomb(path: Path) -> Path:
     """An .npz whose header promises 10^12 numbers."""
-    import zipfile
-
-    head = str({"descr": "<f8", "fortran_order": False, "shape": (10**6, 10**6)}).encode()
-    head += b" " * (-(len(head) + 11) % 64) + b"\n"
-    body = b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("masks.npy", body + b"\0" * 10**6)
+        archive.writestr("masks.npy", promise(10**6, 10**6) + b"\0" * 10**6)
     return path
+
+
+def promise(*shape: int) -> bytes:
+    """Head of an .npy of float64."""
+    stream = io.BytesIO()
+    head = {"descr": "<f8", "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(stream, head)
+    return stream.getvalue()

@@ -6,7 +6,11 @@ Correctives, expressions and hand spaces are random. No number comes from a lice
 """
 
 import pickle
+import sys
+import types
+from functools import cache
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 
@@ -171,6 +175,7 @@ def hands_and_face(name, rng, face, faces):
     return model
 
 
+@cache
 def make_model(name, version="1.0", seed=0, shift=(0.02, 0.31, -0.05)):
     """The arrays of a synthetic file; the template is off the origin, as the true ones are."""
     rng = np.random.default_rng(seed)
@@ -196,8 +201,15 @@ def make_model(name, version="1.0", seed=0, shift=(0.02, 0.31, -0.05)):
     return model | hands_and_face(name, rng, face, faces)
 
 
+def write_models(root, names=("smplh", "smplx")):
+    """Files of neutral models as in the usual folder, which is returned."""
+    for name in names:
+        write_npz(make_model(name), root / name / f"{name.upper()}_NEUTRAL.npz")
+    return root
+
+
 def write_npz(model, path):
-    """As SMPL-X's own: also with members that are pickled objects, which nobody needs."""
+    """As SMPL-X's own: also with members that are pickled objects, which are not needed."""
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez(path, joint2num=np.array({"Pelvis": 0}, dtype=object), **model)
     return path
@@ -212,9 +224,6 @@ Ch.__module__ = "chumpy.ch"
 
 def write_old_pickle(model, path):
     """As SMPL's own of version 1.0: Python 2, chumpy arrays, a sparse regressor."""
-    import sys
-    import types
-
     from scipy import sparse
 
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -226,13 +235,6 @@ def write_old_pickle(model, path):
     module = types.ModuleType("chumpy.ch")
     module.Ch = Ch
     stand_ins = {"chumpy": types.ModuleType("chumpy"), "chumpy.ch": module}
-    before = {key: sys.modules.get(key) for key in stand_ins}
-    sys.modules.update(stand_ins)
-    try:
+    with patch.dict(sys.modules, stand_ins):
         path.write_bytes(pickle.dumps(packed, protocol=2))
-    finally:
-        for key, old in before.items():
-            sys.modules.pop(key)
-            if old is not None:
-                sys.modules[key] = old
     return path

@@ -62,12 +62,8 @@ def right():
         verts, walking.faces, torch.stack([middle, middle + 0.6 * up], 1), ("pelvis", "head"),
         walking.frame, walking.person, 15.0, "camera", None,
     )  # fmt: skip
-    people = People(
-        masks_of(in_image(box_around(verts, camera), camera), *size),
-        bodies.frame,
-        bodies.person,
-        {},
-    )
+    shown = masks_of(in_image(box_around(verts, camera), camera), *size)
+    people = People(shown, bodies.frame, bodies.person, {})
     return Capture("right", scene, None, detections, None, None, bodies, people, None, ())
 
 
@@ -92,12 +88,10 @@ def test_a_fault_is_named_and_mended(right, name):
 
 def test_parts_of_different_pictures_and_nothing_to_compare_are_said(right):
     boxes = [torch.tensor([600.0 - 20 * k, 5, 610 - 20 * k, 10]) for k in range(3)]
-    elsewhere = tuple(
-        replace(one, box=box, mask=None) for one, box in zip(right.detections, boxes, strict=True)
-    )
-    (said,) = check_against_picture(
-        replace(right, detections=elsewhere, bodies=None, people=None)
-    ).warnings
+    pairs = zip(right.detections, boxes, strict=True)
+    elsewhere = tuple(replace(one, box=box, mask=None) for one, box in pairs)
+    lone = replace(right, detections=elsewhere, bodies=None, people=None)
+    (said,) = check_against_picture(lone).warnings
     assert "one room" in said
     first, *rest = right.detections
     (said,) = check_against_picture(

@@ -22,20 +22,13 @@ def chair(**changes: object) -> ObjectArrays:
 
 
 def lamp(**changes: object) -> ObjectArrays:
-    mesh: dict[str, Any] = {
-        "vertices": tiny.STEP / 2 + [0.1, 0.2, 0.3],
-        "faces": torch.from_numpy(tiny.STEP_FACES),
-    }
-    place: dict[str, Any] = {"translation": np.array([0.8, -0.5, -3.2]), "yaw": np.float32(-2.9)}
-    box, mask = (40.5, 10, 59.75, 30), tiny.object_mask(1)
     given: dict[str, Any] = {
-        "scale": [1.0, 1.1, 1.2],
-        "support": "chair_0",
-        "mask": mask,
-        "box": box,
-        **changes,
-    }
-    return ObjectArrays("Lampe_ä.2", "Stehlampe", **mesh, **place, **given)
+        "vertices": tiny.STEP / 2 + [0.1, 0.2, 0.3], "faces": torch.from_numpy(tiny.STEP_FACES),
+        "translation": np.array([0.8, -0.5, -3.2]), "yaw": np.float32(-2.9),
+        "scale": [1.0, 1.1, 1.2], "support": "chair_0", "mask": tiny.object_mask(1),
+        "box": (40.5, 10, 59.75, 30), **changes,
+    }  # fmt: skip
+    return ObjectArrays("Lampe_ä.2", "Stehlampe", **given)
 
 
 def make(**changes: object) -> Capture:

@@ -48,28 +48,41 @@ def save(path: Path, **arrays: Any) -> Path:
     return path / "bodies.npz"
 
 
-def told(path: Path) -> tuple[Any, str]:
+def read(path: Path) -> tuple[Any, str]:
     warnings: list[str] = []
     return read_bodies(path, warnings.append), "\n".join(warnings)
 
 
-def test_parameters_alone_are_posed(tmp_path):
-    found, words = told(save(tmp_path, **rows(), **parameters()))
-    verts, joints = load_model("makehuman").posed(pose())
+MODEL = load_model("makehuman")
+
+
+def meshes_of(shift: float = 0.0) -> dict[str, np.ndarray]:
+    """The parameters' meshes."""
+    verts = MODEL.posed(pose())[0].numpy() + np.float32(shift)
+    return {"vertices": verts, "faces": MODEL.faces.numpy()}
+
+
+def test_parameters_alone_are_posed_also_in_a_capture(tmp_path):
+    found, words = read(save(tmp_path, **rows(), **parameters()))
+    verts, joints = MODEL.posed(pose())
     assert torch.allclose(found.verts, verts, atol=1e-6)
     assert found.joints is not None
     assert torch.allclose(found.joints, joints, atol=1e-6)
-    assert found.joint_names == load_model("makehuman").joint_names
+    assert found.joint_names == MODEL.joint_names
     assert found.pose is not None
     assert not words
+    folder = tiny.write_capture(tmp_path / "tiny")
+    (folder / "contacts.npz").unlink()
+    save(folder, **rows(), **parameters())
+    found = read_capture(folder)
+    assert found.warnings == ()
+    assert found.bodies.pose is not None
 
 
 def test_meshes_count_and_parameters_stay_when_they_agree(tmp_path):
-    verts = load_model("makehuman").posed(pose())[0].numpy() + np.float32(0.004)
-    faces = load_model("makehuman").faces.numpy()
-    path = save(tmp_path, **rows(), **parameters(), vertices=verts, faces=faces)
-    found, words = told(path)
-    assert (found.verts.numpy() == verts).all()
+    meshes = meshes_of(0.004)
+    found, words = read(save(tmp_path, **rows(), **parameters(), **meshes))
+    assert (found.verts.numpy() == meshes["vertices"]).all()
     assert found.pose is not None
     assert not words
 
@@ -80,18 +93,13 @@ def test_meshes_count_and_parameters_stay_when_they_agree(tmp_path):
     ({"body_pose": np.zeros((ROWS, 69))}, "cannot be used"),
 ])  # fmt: skip
 def test_parameters_that_do_not_give_the_meshes_are_left_out_with_a_word(tmp_path, change, words):
-    meshes = {"vertices": load_model("makehuman").posed(pose())[0].numpy()}
-    meshes["faces"] = load_model("makehuman").faces.numpy()
-    found, told_words = told(save(tmp_path, **rows(), **{**parameters(), **change}, **meshes))
+    found, said = read(save(tmp_path, **rows(), **{**parameters(), **change}, **meshes_of()))
     assert found.pose is None
-    assert words in told_words
-    assert "rigidly" in told_words
-
-
-def test_meshes_of_another_topology_with_parameters_are_refined_rigidly(tmp_path):
-    found, words = told(save(tmp_path, **tiny.bodies(), **parameters()))
+    assert words in said
+    assert "rigidly" in said
+    found, said = read(save(tmp_path, **tiny.bodies(), **parameters()))  # another topology
     assert found.pose is None
-    assert "4" in words
+    assert "4" in said
 
 
 @pytest.mark.parametrize(("change", "words"), [
@@ -116,24 +124,23 @@ def test_wrong_parameters_are_named(tmp_path, change, words):
 def test_people_of_the_mean_shape_are_of_unknown_height_also_where_no_model_checks_it(tmp_path):
     own = {k: v for k, v in parameters().items() if k != "model"}
     meshes = {k: v for k, v in tiny.bodies().items() if k in ("vertices", "faces")}
-    found, _ = told(save(tmp_path, **rows(), **own, **meshes, model=np.array("smplx")))
+    found, _ = read(save(tmp_path, **rows(), **own, **meshes, model=np.array("smplx")))
     assert found.pose is None  # no file of that model is here
     assert found.mean_shape
     assert size_spread(found, 0.055) == 0.055
     own["betas"] = own["betas"] + 0.8
-    found, _ = told(save(tmp_path, **rows(), **own, **meshes, model=np.array("smplx")))
+    found, _ = read(save(tmp_path, **rows(), **own, **meshes, model=np.array("smplx")))
     assert not found.mean_shape
     assert size_spread(found, 0.055) == 0
-    found, _ = told(save(tmp_path, **rows(), **meshes))
+    found, _ = read(save(tmp_path, **rows(), **meshes))
     assert not found.mean_shape
 
 
 def test_bodies_survive_writing(tmp_path):
-    first, _ = told(
-        save(tmp_path, **rows(), **parameters(), fps=np.array(12.5), size_spread=np.array(0.03))
-    )
+    more = {"fps": np.array(12.5), "size_spread": np.array(0.03)}
+    first, _ = read(save(tmp_path, **rows(), **parameters(), **more))
     write_bodies(first, tmp_path / "copy.npz")
-    second, words = told(tmp_path / "copy.npz")
+    second, words = read(tmp_path / "copy.npz")
     assert not words
     assert torch.equal(first.verts, second.verts)
     assert second.pose is not None
@@ -146,23 +153,14 @@ def test_bodies_survive_writing(tmp_path):
 
 
 def test_parameters_of_world_bodies_turn_with_their_meshes(tmp_path):
-    world, _ = told(save(tmp_path, **{**rows(), "space": np.array("world")}, **parameters()))
+    world, _ = read(save(tmp_path, **{**rows(), "space": np.array("world")}, **parameters()))
     R = torch.from_numpy(tiny.rotation(-0.3, 0.1, 0.8)).float()
     found = into_camera(world, R)
     assert found.space == "camera"
     assert torch.allclose(found.verts, world.verts @ R.mT, atol=1e-6)
     assert found.pose is not None
-    again, _ = load_model("makehuman").posed(found.pose)
+    again, _ = MODEL.posed(found.pose)
     assert torch.allclose(again, found.verts, atol=2e-5)
-
-
-def test_a_capture_with_parameters_only_is_read(tmp_path):
-    folder = tiny.write_capture(tmp_path / "tiny")
-    (folder / "contacts.npz").unlink()
-    save(folder, **rows(), **parameters())
-    found = read_capture(folder)
-    assert found.warnings == ()
-    assert found.bodies.pose is not None
 
 
 @dataclass(frozen=True)
@@ -185,7 +183,7 @@ class Puppet:
 def test_the_root_turns_about_the_pelvis(tmp_path, monkeypatch):
     monkeypatch.setattr("mover.io.capture.pose_file.load_model", lambda *_: Puppet())
     given = {**parameters(), "model": np.array("smplx")}
-    world, _ = told(save(tmp_path, **{**rows(), "space": np.array("world")}, **given))
+    world, _ = read(save(tmp_path, **{**rows(), "space": np.array("world")}, **given))
     found = into_camera(world, torch.from_numpy(tiny.rotation(-0.3, 0.1, 0.8)).float())
     assert found.pose is not None
     assert torch.allclose(Puppet().posed(found.pose)[0], found.verts, atol=1e-5)

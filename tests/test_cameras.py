@@ -1,9 +1,10 @@
 """A moving camera's poses come in from every tool's own layout, and wrong ones are refused."""
 
-import dataclasses
 import json
+import re
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -128,18 +129,20 @@ def test_every_tool_has_a_fixture():
 
 @pytest.fixture
 def capture():
-    bodies = little_room.walkers(2)
-    bodies = dataclasses.replace(bodies, verts=bodies.verts * torch.tensor([1.0, -1, -1]))
-    return Capture(
-        "room", dataclasses.replace(little_room.room(), objects=()), None, (), None, None,
-        dataclasses.replace(bodies, space="camera"), None, None, (),
-    )  # fmt: skip
+    bodies, room = little_room.walkers(2), replace(little_room.room(), objects=())
+    verts = bodies.verts * torch.tensor([1.0, -1, -1])
+    bodies = replace(bodies, verts=verts, space="camera")
+    return Capture("room", room, None, (), None, None, bodies, None, None, ())
 
 
-def points_of(path, frames: list[int]) -> torch.Tensor:
-    """A few points that each frame's camera sees, in the axes of the reference camera."""
-    seen = torch.tensor([[0.3, 0.2, 3.0], [-1, 0.5, 4]]).expand(len(frames), 2, 3)
-    return to_reference(seen, poses_at(path, torch.tensor(frames)))
+SEEN = torch.tensor([[0.3, 0.2, 3.0], [-1, 0.5, 4]]).expand(COUNT, 2, 3)
+
+
+def path_from(capture: Capture, T: Any, **more: Any):
+    """The path of these arrays, and what is said of it."""
+    said: list[str] = []
+    at = At({"frame": np.arange(COUNT), "T_world_camera": T, **more}, "cameras.npz")
+    return path_of(at, capture.scene.camera, capture.bodies, said.append), said
 
 
 @pytest.mark.parametrize("tool", WRITERS)
@@ -153,14 +156,12 @@ def test_the_poses_of_every_tool_come_back_from_a_capture(tool, capture, tmp_pat
     at = At({**at.value, "reference": np.array(2)}, at.file)
     import_into(folder, Parts("cameras", cameras=at))
     path = read_capture(folder).path
-    true = np.linalg.inv(true_path()[2]) @ true_path()
-    seen = np.array([[0.3, 0.2, 3.0, 1], [-1, 0.5, 4, 1]])
-    expected = torch.tensor(np.einsum("tij,pj->tpi", true, seen)[..., :3]).float()
-    assert torch.allclose(points_of(path, list(range(COUNT))), expected, atol=1e-5)
-    again = path_of(
-        At(path_to_arrays(path), "cameras.npz"), capture.scene.camera, None, list[str]().append
-    )
-    assert torch.allclose(points_of(again, list(range(COUNT))), expected, atol=1e-5)
+    true = torch.from_numpy(np.linalg.inv(true_path()[2]) @ true_path()).float()
+    expected = SEEN @ true[:, :3, :3].mT + true[:, None, :3, 3]
+    again = path_of(At(path_to_arrays(path), "c"), capture.scene.camera, None, list[str]().append)
+    for one in (path, again):
+        found = to_reference(SEEN, poses_at(one, torch.arange(COUNT)))
+        assert torch.allclose(found, expected, atol=1e-5)
 
 
 def test_simple_vo_of_gvhmr_leads_from_world_to_camera(tmp_path):
@@ -170,15 +171,12 @@ def test_simple_vo_of_gvhmr_leads_from_world_to_camera(tmp_path):
     assert np.allclose(at.value["T_world_camera"], true_path())
 
 
-def test_whams_sign_for_no_slam_is_refused(tmp_path):
+def test_whams_sign_for_no_slam_and_colmaps_binary_poses_are_refused_with_their_cure(tmp_path):
     row = np.zeros((COUNT, 7))
     row[:, 3] = 1
     joblib.dump(row, tmp_path / "slam_results.pth")
     with pytest.raises(InputError, match="camera that was followed"):
         read_slam(tmp_path)
-
-
-def test_colmaps_binary_poses_are_named_with_their_cure(tmp_path):
     (tmp_path / "images.bin").write_bytes(bytes(8))
     for path in (tmp_path, tmp_path / "images.bin"):
         with pytest.raises(InputError, match=r"^images\.bin: .*model_converter --output_type TXT"):
@@ -204,8 +202,7 @@ def test_wrong_text_is_refused_in_a_sentence(file, line, words, tmp_path):
 
 
 def test_a_pose_between_two_is_half_way(capture):
-    at = {"frame": np.arange(COUNT) * 10, "T_world_camera": true_path()}
-    path = path_of(At(at, "cameras.npz"), capture.scene.camera, None, list[str]().append)
+    path, _ = path_from(capture, true_path(), frame=np.arange(COUNT) * 10)
     ends = poses_at(path, torch.tensor([0, 10, 20]))
     middle = poses_at(path, torch.tensor([5, 15]))
     t = ends.t_reference_camera
@@ -215,9 +212,8 @@ def test_a_pose_between_two_is_half_way(capture):
     assert torch.allclose(step, R[0].mT @ middle.R_reference_camera[0], atol=1e-6)
 
 
-def test_points_go_there_and_back_and_a_larger_scale_moves_the_camera_alone():
-    at = {"frame": np.arange(COUNT), "T_world_camera": true_path()}
-    path = path_of(At(at, "cameras.npz"), little_room.camera(), None, list[str]().append)
+def test_points_go_there_and_back_and_a_larger_scale_moves_the_camera_alone(capture):
+    path, _ = path_from(capture, true_path())
     poses = poses_at(path, torch.arange(COUNT))
     points = torch.randn(COUNT, 5, 3, generator=torch.Generator().manual_seed(0))
     assert torch.allclose(from_reference(to_reference(points, poses), poses), points, atol=1e-5)
@@ -227,49 +223,39 @@ def test_points_go_there_and_back_and_a_larger_scale_moves_the_camera_alone():
 
 
 def test_a_camera_that_never_moves_is_the_still_one(capture):
-    at = {"frame": np.arange(COUNT), "T_world_camera": np.tile(true_path()[:1], (COUNT, 1, 1))}
-    path = path_of(At(at, "cameras.npz"), capture.scene.camera, capture.bodies, list[str]().append)
+    path, _ = path_from(capture, np.tile(true_path()[:1], (COUNT, 1, 1)))
     assert path is STILL
     assert is_still(path)
     points = torch.randn(3, 4, 3)
     assert torch.equal(to_reference(points, poses_at(path, torch.arange(3))), points)
 
 
-def test_wrong_cameras_are_refused_in_a_sentence(capture):
+def test_wrong_cameras_are_refused_in_a_sentence_and_another_lens_is_said(capture):
     T, good = true_path(), np.arange(COUNT)
-    zoom = np.linspace(0.6, 0.8, COUNT)
-    mirrored = T @ np.diag([-1.0, 1, 1, 1])
-    cases = [
-        ({"frame": good[::-1], "T_world_camera": T}, "rising frames"),
-        ({"frame": good, "T_world_camera": T[:3]}, r"shape \(6, 4, 4\)"),
-        ({"frame": good, "T_world_camera": mirrored}, "rotation and translation"),
-        ({"frame": good, "T_world_camera": T * 2}, "rotation and translation"),
-        ({"frame": good, "T_world_camera": T, "focal": zoom}, "no zoom"),
-        ({"frame": good, "T_world_camera": T, "reference": np.array(9)}, "has a pose"),
-        ({"frame": good + 2, "T_world_camera": T}, "for all bodies, also for frame 0"),
-        ({"frame": good}, "T_world_camera"),
-    ]
-    for arrays, words in cases:
+    for arrays, words in (
+        ({"T": T, "frame": good[::-1]}, "rising frames"),
+        ({"T": T[:3]}, r"shape \(6, 4, 4\)"),
+        ({"T": T @ np.diag([-1.0, 1, 1, 1])}, "rotation and translation"),
+        ({"T": T * 2}, "rotation and translation"),
+        ({"T": T, "focal": np.linspace(0.6, 0.8, COUNT)}, "no zoom"),
+        ({"T": T, "reference": np.array(9)}, "has a pose"),
+        ({"T": T, "frame": good + 2}, "for all bodies, also for frame 0"),
+    ):
         with pytest.raises(InputError, match=words):
-            path_of(
-                At(arrays, "cameras.npz"), capture.scene.camera, capture.bodies, list[str]().append
-            )
+            path_from(capture, **arrays)
+    with pytest.raises(InputError, match="T_world_camera"):
+        path_of(At({"frame": good}, "c"), capture.scene.camera, capture.bodies, list[str]().append)
+    _, said = path_from(capture, T, focal=np.full(COUNT, 0.9))
+    assert "focal length is 0.9 widths" in said[0]
 
 
 def test_people_of_a_moving_camera_must_be_in_its_axes(capture, tmp_path):
     assert capture.bodies is not None
-    world = dataclasses.replace(capture.bodies, space="world")
-    write_capture(dataclasses.replace(capture, bodies=world), tmp_path / "room")
+    world = replace(capture.bodies, space="world")
+    write_capture(replace(capture, bodies=world), tmp_path / "room")
     at = At({"frame": np.arange(COUNT), "T_world_camera": true_path()}, "cameras.npz")
     with pytest.raises(InputError, match="'space' has 'world', expected 'camera'"):
         import_into(tmp_path / "room", Parts("cameras", cameras=at))
-
-
-def test_another_lens_is_said(capture):
-    said: list[str] = []
-    at = {"frame": np.arange(COUNT), "T_world_camera": true_path(), "focal": np.full(COUNT, 0.9)}
-    path_of(At(at, "cameras.npz"), capture.scene.camera, None, said.append)
-    assert "focal length is 0.9 widths" in said[0]
 
 
 # Lenses, as calibrations give them: the same one in every form.
@@ -364,5 +350,4 @@ def test_what_is_no_lens_is_named_in_the_users_words(kind, tmp_path):
     with pytest.raises(InputError, match=words) as caught:
         read_camera_file(written(tmp_path, name, content), None)
     assert str(caught.value).startswith(name)
-    assert "Error" not in str(caught.value)
-    assert "could not convert" not in str(caught.value)
+    assert not re.search("Error|could not convert", str(caught.value))

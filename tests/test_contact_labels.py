@@ -33,10 +33,7 @@ def standing(frames: int = 6) -> Bodies:
     )
 
 
-LEVEL = GROUND
-
-
-def labelled(bodies: Bodies, *meshes: Mesh, floor: float | None = LEVEL) -> ContactLabels:
+def labelled(bodies: Bodies, *meshes: Mesh, floor: float | None = GROUND) -> ContactLabels:
     ids = tuple(f"box_{k}" for k in range(len(meshes)))
     stands = tuple((StandingMesh(mesh),) for mesh in meshes)
     return label_contacts(LabelInputs(bodies, parts_of(bodies), stands, ids, floor), LabelConfig())
@@ -113,15 +110,6 @@ def out_with_labels(tmp_path: Path) -> tuple[Path, ContactLabels]:
     return out, labels
 
 
-def test_labels_come_back_from_their_file(tmp_path):
-    out, labels = out_with_labels(tmp_path)
-    again = read_labels(out / "contacts.npz")
-    for field in dataclasses.fields(ContactLabels):
-        before, after = getattr(labels, field.name), getattr(again, field.name)
-        same = before == after
-        assert same if isinstance(same, bool) else same.all(), field.name
-
-
 @pytest.mark.parametrize("up", ["y", "z"])
 def test_tables_hold_each_label_at_its_frame_part_and_object(tmp_path, up):
     out, labels = out_with_labels(tmp_path)
@@ -133,10 +121,8 @@ def test_tables_hold_each_label_at_its_frame_part_and_object(tmp_path, up):
     assert data["object_contact"].shape == (frames, things)
     seen = np.zeros_like(data["contact"], dtype=bool)
     for k in range(len(labels.frame)):
-        at = (
-            data["frame"].tolist().index(int(labels.frame[k])),
-            int(labels.part[k]), int(labels.object[k]),
-        )  # fmt: skip
+        row = data["frame"].tolist().index(int(labels.frame[k]))
+        at = row, int(labels.part[k]), int(labels.object[k])
         seen[at] = True
         x, y, z = labels.position[k].tolist()
         truth = (x, y, z) if up == "y" else (x, -z, y - GROUND)
@@ -154,13 +140,18 @@ def test_a_result_without_labels_says_what_writes_them(tmp_path, capsys):
     assert "`mover run` writes it" in capsys.readouterr().err
 
 
-def test_a_wrong_file_is_refused(tmp_path):
-    out, _ = out_with_labels(tmp_path)
+def test_labels_come_back_from_their_file_and_a_wrong_one_is_refused(tmp_path):
+    out, labels = out_with_labels(tmp_path)
+    again = read_labels(out / "contacts.npz")
+    for field in dataclasses.fields(ContactLabels):
+        same = getattr(labels, field.name) == getattr(again, field.name)
+        assert same if isinstance(same, bool) else same.all(), field.name
     with np.load(out / "contacts.npz") as data:
         arrays = dict(data)
-    np.savez(out / "contacts.npz", **{**arrays, "normal": arrays["normal"][:, :2]})
-    with pytest.raises(InputError, match=r"contacts\.npz: 'normal' has shape .* expected"):
-        read_labels(out / "contacts.npz")
-    np.savez(out / "contacts.npz", probability=np.zeros((2, 3)))
-    with pytest.raises(InputError, match=r"contacts\.npz: lacks frame"):
-        read_labels(out / "contacts.npz")
+    for wrong, words in (
+        ({**arrays, "normal": arrays["normal"][:, :2]}, "'normal' has shape .* expected"),
+        ({"probability": np.zeros((2, 3))}, "lacks frame"),
+    ):
+        np.savez(out / "contacts.npz", **wrong)
+        with pytest.raises(InputError, match=rf"contacts\.npz: {words}"):
+            read_labels(out / "contacts.npz")

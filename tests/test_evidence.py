@@ -37,12 +37,8 @@ def room(hide: bool) -> Capture:
     masks = np.stack([disc(-1.5), disc(0.0) & (~left if hide else True)])
     other = np.zeros_like(left)
     other[:5, :5] = True
-    step: dict[str, Any] = {
-        "vertices": tiny.STEP,
-        "faces": tiny.STEP_FACES,
-        "translation": (0, 0, -3),
-        "yaw": 0,
-    }
+    step: dict[str, Any] = {"vertices": tiny.STEP, "faces": tiny.STEP_FACES,
+                            "translation": (0, 0, -3), "yaw": 0}  # fmt: skip
     return capture_from_arrays(
         CAMERA,
         [

@@ -1,9 +1,9 @@
 """Exports, read back by other programs or by a few naive lines: everything is where it was."""
 
-import dataclasses
 import json
 import math
 import struct
+from dataclasses import astuple, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +13,15 @@ import torch
 import trimesh
 from furnished import bodies_of, furnished, moving_pose, similar, two_people, write_out
 from little_room import walkers
+from PIL import Image
+from test_export import bounds_of, textured
 
 import mover.io.export.solids
 import mover.io.export.usd
 from mover.app.cli import run_command
 from mover.bodies.skinning import open_body
 from mover.core.errors import InputError
-from mover.core.types import Bodies, BodyPose, Scene, SceneObject, Segment
+from mover.core.types import Bodies, BodyPose, Scene, Segment
 from mover.geometry.placement import place_object, placed_at
 from mover.io.export.amass import export_amass
 from mover.io.export.finished import Finished, keyframes, read_finished
@@ -33,20 +35,12 @@ WIDTH = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
 
 def scaled(scene: Scene) -> Scene:
-    pieces = [
-        dataclasses.replace(p, scale=torch.tensor([1.2, 0.9, 1.1]) + 0.05 * k)
-        for k, p in enumerate(scene.objects)
-    ]
-    return dataclasses.replace(scene, objects=tuple(pieces))
+    size, pieces = torch.tensor([1.2, 0.9, 1.1]), enumerate(scene.objects)
+    return replace(scene, objects=tuple(replace(p, scale=size + 0.05 * k) for k, p in pieces))
 
 
 def finished(tmp_path: Path, bodies: Bodies | None = None) -> Finished:
     return read_finished(write_out(tmp_path / "out", scaled(furnished()), bodies))
-
-
-def world(piece: SceneObject) -> np.ndarray:
-    verts = place_object(piece).verts.numpy()
-    return np.stack([verts.min(0), verts.max(0)])
 
 
 class Glb:
@@ -139,24 +133,29 @@ def rows(bodies: Bodies, person: int) -> list[tuple[int, float]]:
     ]
 
 
+def miss(found: np.ndarray, verts: torch.Tensor) -> float:
+    """Largest distance between vertices [m]."""
+    return float(np.linalg.norm(found - verts.numpy(), axis=1).max())
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory):
+    """Two people, and their export on bones."""
+    folder, bodies = tmp_path_factory.mktemp("two"), two_people()
+    return bodies, export_glb(finished(folder, bodies), folder)
+
+
 @pytest.mark.parametrize("person", [0, 1])
-def test_bones_carry_the_skin_to_the_result_in_every_frame(tmp_path, person):
-    bodies = two_people()
-    found = export_glb(finished(tmp_path, bodies), tmp_path)
-    glb = Glb(found.files[0])
-    worst = max(
-        np.linalg.norm(
-            glb.skinned(f"person_{person}_body", t) - bodies.verts[k].numpy(), axis=1
-        ).max()
-        for k, t in rows(bodies, person)
-    )
+def test_bones_carry_the_skin_to_the_result_in_every_frame(two, person):
+    bodies, found = two
+    glb, name = Glb(found.files[0]), f"person_{person}_body"
+    worst = max(miss(glb.skinned(name, t), bodies.verts[k]) for k, t in rows(bodies, person))
     assert worst < 0.006  # four weights a vertex, where the model has six
     assert f"{1e3 * worst:.0f} mm" in " ".join(found.notes) or person == 1
 
 
-def test_a_person_is_hidden_while_they_are_not_seen(tmp_path):
-    bodies = two_people()
-    glb = Glb(export_glb(finished(tmp_path, bodies), tmp_path).files[0])
+def test_a_person_is_hidden_while_they_are_not_seen(two):
+    bodies, glb = two[0], Glb(two[1].files[0])
     seen = [t for _, t in rows(bodies, 1)]
     gap = int(np.argmax(np.diff(seen)))
     for time, size in ((0.0, 0.0), (seen[0], 1.0), (seen[gap], 1.0), (seen[gap] + 1.5, 0.0)):
@@ -168,41 +167,34 @@ def test_a_person_is_hidden_while_they_are_not_seen(tmp_path):
 def test_shapes_are_the_result_at_the_keys_and_near_it_between(tmp_path):
     bodies = bodies_of(moving_pose(30, pace=0.1))
     glb = Glb(export_glb(finished(tmp_path, bodies), tmp_path, "morph").files[0])
-    miss = np.array([
-        np.linalg.norm(glb.morphed("person_0_body", t) - bodies.verts[k].numpy(), axis=1).max()
-        for k, t in rows(bodies, 0)
-    ])  # fmt: skip
+    off = [miss(glb.morphed("person_0_body", t), bodies.verts[k]) for k, t in rows(bodies, 0)]
     keys = len(glb.tree["meshes"][-1]["primitives"][0]["targets"]) + 1
-    assert (miss < 1e-5).sum() >= keys
-    assert miss.max() < 0.0055
+    assert sum(v < 1e-5 for v in off) >= keys
+    assert max(off) < 0.0055
     assert keys < 30
 
 
-def test_bodies_without_parameters_still_move(tmp_path):
+def test_bodies_without_parameters_still_move_and_have_no_bones_and_no_parameters(tmp_path):
     bodies = walkers(20, people=2)
-    found = export_glb(finished(tmp_path, bodies), tmp_path)
-    glb = Glb(found.files[0])
+    home = finished(tmp_path, bodies)
+    found = export_glb(home, tmp_path)
     k, t = rows(bodies, 1)[-1]
-    assert glb.morphed("person_1_body", t) == pytest.approx(bodies.verts[k].numpy(), abs=1e-5)
+    assert miss(Glb(found.files[0]).morphed("person_1_body", t), bodies.verts[k]) < 1e-5
     assert "--capture" in " ".join(found.notes)
-
-
-def test_bones_that_are_asked_for_and_not_there_are_refused(tmp_path):
     with pytest.raises(InputError, match="--body skin"):
-        export_glb(finished(tmp_path, walkers(2)), tmp_path, "skin")
+        export_glb(home, tmp_path, "skin")
+    with pytest.raises(InputError, match="--capture"):
+        export_amass(home, tmp_path)
 
 
 def test_parameters_of_the_capture_move_bodies_that_were_turned_and_sized(tmp_path):
-    truth = two_people()
-    scene = scaled(furnished())
+    truth, scene = two_people(), scaled(furnished())
     grown, turn = similar(truth, 1.03)
-    given = dataclasses.replace(truth, space="camera")
-    result = dataclasses.replace(grown, space="world")
+    result, given = replace(grown, space="world"), replace(truth, space="camera")
     home = Finished(write_out(tmp_path / "out", scene), scene, result, given)
     glb = Glb(export_glb(home, tmp_path).files[0])
     k, t = rows(result, 1)[3]
-    miss = np.linalg.norm(glb.skinned("person_1_body", t) - result.verts[k].numpy(), axis=1)
-    assert miss.max() < 0.006
+    assert miss(glb.skinned("person_1_body", t), result.verts[k]) < 0.006
     arrays = np.load(export_amass(home, tmp_path).files[1])
     assert arrays["size"] == pytest.approx(1.03, abs=1e-4)
     assert turn.shape == (3, 3)
@@ -215,7 +207,7 @@ def test_trimesh_opens_the_file_with_the_objects_in_place(tmp_path):
         node = next(n for n in scene.graph.nodes_geometry if n.startswith(f"{piece.id}_mesh"))
         transform, name = scene.graph[node]
         part = scene.geometry[name].copy().apply_transform(transform)
-        assert part.bounds == pytest.approx(world(piece), abs=1e-5)
+        assert part.bounds == pytest.approx(bounds_of(piece), abs=1e-5)
 
 
 @pytest.mark.parametrize("people", [False, True])
@@ -223,11 +215,9 @@ def test_an_object_that_is_moved_jumps_to_its_next_place(tmp_path, people):
     home = finished(tmp_path, two_people(4) if people else None)
     piece, *others = home.scene.objects
     later = Segment(8, piece.t_world_object + torch.tensor([0.0, 0.0, 1.0]), piece.yaw + 1)
-    moved = dataclasses.replace(
-        piece, segments=(Segment(0, piece.t_world_object, piece.yaw), later)
-    )
-    scene = dataclasses.replace(home.scene, objects=(moved, *others))
-    glb = Glb(export_glb(dataclasses.replace(home, scene=scene), tmp_path).files[0])
+    moved = replace(piece, segments=(Segment(0, piece.t_world_object, piece.yaw), later))
+    scene = replace(home.scene, objects=(moved, *others))
+    glb = Glb(export_glb(replace(home, scene=scene), tmp_path).files[0])
     first, step = 0, 0.2
     if home.bodies is not None and home.bodies.fps is not None:
         first, step = int(home.bodies.frame.min()), 1 / home.bodies.fps
@@ -241,7 +231,7 @@ def test_an_object_that_is_moved_jumps_to_its_next_place(tmp_path, people):
 def test_no_frame_between_keys_is_farther_off_than_is_said_and_few_keys_are_few():
     verts = bodies_of(moving_pose(60)).verts
     time = torch.linspace(0, 4, 60).double().square()  # uneven
-    keys, miss = keyframes(verts, time, 0.004, 1000)
+    keys, off = keyframes(verts, time, 0.004, 1000)
     seen = verts[:, :: max(1, verts.shape[1] // 300)].numpy()
     worst = 0.0
     for k in range(60):
@@ -250,13 +240,12 @@ def test_no_frame_between_keys_is_farther_off_than_is_said_and_few_keys_are_few(
         share = 0.0 if a == b else float((time[k] - time[a]) / (time[b] - time[a]))
         line = seen[a] + share * (seen[b] - seen[a])
         worst = max(worst, float(np.linalg.norm(line - seen[k], axis=1).max()))
-    assert worst == pytest.approx(miss, abs=1e-6)
-    assert miss <= 0.004
-    assert keys[0] == 0
-    assert keys[-1] == 59
-    few, miss = keyframes(verts, time, 0.0, 7)
+    assert worst == pytest.approx(off, abs=1e-6)
+    assert off <= 0.004
+    assert (keys[0], keys[-1]) == (0, 59)
+    few, off = keyframes(verts, time, 0.0, 7)
     assert len(few) == 7
-    assert miss > 0
+    assert off > 0
 
 
 @pytest.fixture(autouse=True)
@@ -267,33 +256,18 @@ def along_the_axes(monkeypatch):
 
 def test_usd_keeps_textures_and_names_that_it_does_not_allow(tmp_path):
     Usd = pytest.importorskip("pxr.Usd", reason="needs usd-core")
-    from PIL import Image
-
-    box = trimesh.creation.box(extents=(0.5, 0.9, 0.5))
-    picture = Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3))
-    uv = np.random.default_rng(0).random((len(box.vertices), 2))
-    material = trimesh.visual.material.PBRMaterial(
-        baseColorTexture=picture, baseColorFactor=[51, 255, 102, 255]
-    )
-    box.visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
-    box.export(tmp_path / "box.glb")
-    scene = furnished(("chair",))
-    pieces = [
-        dataclasses.replace(scene.objects[0], id=name, mesh_file=str(tmp_path / "box.glb"))
-        for name in ("0-chair.a", "0-chair_a")
-    ]
-    home = Finished(tmp_path, dataclasses.replace(scene, objects=tuple(pieces)), None, None)
+    textured(baseColorFactor=[51, 255, 102, 255]).export(tmp_path / "box.glb")
+    scene, names = furnished(("chair",)), ("0-chair.a", "0-chair_a")
+    chair = replace(scene.objects[0], mesh_file=str(tmp_path / "box.glb"))
+    scene = replace(scene, objects=tuple(replace(chair, id=name) for name in names))
+    home = Finished(tmp_path, scene, None, None)
     stage = Usd.Stage.Open(str(export_usd(home, tmp_path / "usd").files[0]))
     ids = {p.GetCustomDataByKey("mover:id") for p in stage.Traverse()} - {None}
-    assert ids == {"0-chair.a", "0-chair_a"}
-    files = [
-        p.GetAttribute("inputs:file").Get() for p in stage.Traverse() if p.GetName() == "picture"
-    ]
-    assert len(files) == 2
-    pictures = [p for p in stage.Traverse() if p.GetName() == "picture"]
-    scale = pictures[0].GetAttribute("inputs:scale").Get()
+    assert ids == set(names)
+    picture, _ = (p for p in stage.Traverse() if p.GetName() == "picture")
+    scale = picture.GetAttribute("inputs:scale").Get()
     assert list(scale) == pytest.approx([0.2, 1.0, 0.4, 1.0])  # glTF multiplies them, too
-    found = Image.open(tmp_path / "usd" / files[0].path)
+    found = Image.open(tmp_path / "usd" / picture.GetAttribute("inputs:file").Get().path)
     assert np.array_equal(np.asarray(found).ravel(), np.arange(48))
 
 
@@ -321,20 +295,14 @@ def test_the_parameters_give_the_bodies_back(tmp_path, up):
         assert arrays["mocap_framerate"] == 5.0  # every second frame of 10 a second
 
 
-def test_bodies_without_parameters_are_refused_with_the_way_out(tmp_path):
-    home = finished(tmp_path, walkers(3))
-    with pytest.raises(InputError, match="--capture"):
-        export_amass(home, tmp_path)
-
-
 def test_single_objects_stand_in_the_world(tmp_path):
     home = finished(tmp_path)
     files = export_ply(home, tmp_path).files
     for piece, file in zip(home.scene.objects, files, strict=True):
         assert file.name == f"{piece.id}.ply"
         found = trimesh.load_mesh(file)
-        truth = trimesh.Trimesh(*(x.numpy() for x in dataclasses.astuple(place_object(piece))))
-        assert found.bounds == pytest.approx(world(piece), abs=1e-5)
+        truth = trimesh.Trimesh(*(x.numpy() for x in astuple(place_object(piece))))
+        assert found.bounds == pytest.approx(bounds_of(piece), abs=1e-5)
         assert found.area == pytest.approx(truth.area, rel=1e-4)
 
 
@@ -364,7 +332,7 @@ def test_angles_turn_back(tmp_path):
     """Quaternions of neighbouring frames are on one side, so that viewers turn the short way."""
     pose = moving_pose(40)
     spin = torch.linspace(0, 4 * math.pi, 40)
-    pose = dataclasses.replace(pose, global_orient=torch.stack([0 * spin, spin, 0 * spin], -1))
+    pose = replace(pose, global_orient=torch.stack([0 * spin, spin, 0 * spin], -1))
     glb = Glb(export_glb(finished(tmp_path, bodies_of(pose)), tmp_path).files[0])
     animation = glb.tree["animations"][0]
     for channel in animation["channels"]:

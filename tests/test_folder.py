@@ -2,6 +2,7 @@ import dataclasses
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,6 @@ import torch
 
 from mover.core.errors import InputError
 from mover.core.records import map_tensors
-from mover.core.types import Capture
 from mover.geometry.camera import pitch_roll
 from mover.geometry.rle import decode
 from mover.io.capture.folder import read_capture, write_capture
@@ -23,10 +23,6 @@ DATA = Path(__file__).parents[2] / "shared" / "data"
 @pytest.fixture
 def folder(tmp_path):
     return tiny.write_capture(tmp_path / "tiny")
-
-
-def edit(path: Path, **changes: object) -> None:
-    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
 
 
 def close(a: object, b: object) -> None:
@@ -48,23 +44,21 @@ def close(a: object, b: object) -> None:
         assert a == b
 
 
-def test_every_field_of_a_capture_arrives(folder):
+def test_every_field_of_a_capture_arrives_and_truth_is_not_looked_at(folder):
+    (folder / "truth").mkdir()
+    (folder / "truth" / "scene.json").write_text("broken")
     found = read("folder", folder)
     assert found.name == "tiny"
     assert found.camera_height == 1.45
     camera = found.scene.camera
     assert (camera.width, camera.height) == (tiny.WIDTH, tiny.HEIGHT)
     assert camera.K.tolist() == [[60.0, 0.0, 30.5], [0.0, 58.5, 25.25], [0.0, 0.0, 1.0]]
-    assert [float(v) for v in pitch_roll(camera.R_cam_world)] == pytest.approx(
-        [tiny.PITCH, tiny.ROLL], abs=1e-6
-    )
+    tilt = [float(v) for v in pitch_roll(camera.R_cam_world)]
+    assert tilt == pytest.approx([tiny.PITCH, tiny.ROLL], abs=1e-6)
     chair, lamp = found.scene.objects
-    assert (chair.id, chair.category, chair.annotation, chair.support) == (
-        "chair_0", "chair", 11, "ground",
-    )  # fmt: skip
-    assert (lamp.id, lamp.category, lamp.annotation, lamp.support) == (
-        "Lampe_ä.2", "Stehlampe", 5, "chair_0",
-    )  # fmt: skip
+    assert [(p.id, p.category, p.annotation, p.support) for p in (chair, lamp)] == [
+        ("chair_0", "chair", 11, "ground"), ("Lampe_ä.2", "Stehlampe", 5, "chair_0"),
+    ]  # fmt: skip
     assert torch.allclose(lamp.t_world_object, torch.tensor([0.8, -0.5, -3.2]))
     assert float(lamp.yaw) == pytest.approx(-2.9)
     assert torch.allclose(chair.scale, torch.tensor([0.5, 0.9, 0.6]))
@@ -110,8 +104,11 @@ def test_bodies_take_the_frame_rate_of_people_json(folder):
     assert found.fps == 30
 
 
-def test_writing_and_reading_gives_the_same_capture(folder, tmp_path):
+def test_writing_and_reading_gives_the_same_capture_also_of_double_precision(folder, tmp_path):
     first = read_capture(folder)
+    double = map_tensors(lambda x: x.double() if x.is_floating_point() else x, first)
+    write_capture(double, tmp_path / "double")
+    close(first, read_capture(tmp_path / "double"))
     write_capture(first, tmp_path / "copy")
     second = read_capture(tmp_path / "copy")
     close(first, second)
@@ -127,30 +124,25 @@ def test_writing_and_reading_gives_the_same_capture(folder, tmp_path):
 def test_a_capture_without_anything_optional_is_read_with_a_word_about_each(folder):
     for name in ("bodies.npz", "people.json", "contacts.npz"):
         (folder / name).unlink()
-    (folder / "camera.json").write_text(
-        json.dumps({k: v for k, v in tiny.camera().items() if k != "R_cam_world"})
-    )
-    objects = tiny.objects()
-    del objects["images"][0]["file_name"]
-    objects["annotations"][1].pop("segmentation")
+    camera, objects, scene = tiny.camera(), tiny.objects(), tiny.scene()
+    del camera["R_cam_world"], objects["images"][0]["file_name"]
+    del objects["annotations"][1]["segmentation"], scene["objects"][1]["annotation"]
     objects["annotations"].append({**objects["annotations"][0], "id": 99})
-    (folder / "objects.json").write_text(json.dumps(objects))
-    scene = tiny.scene()
-    scene["objects"][1].pop("annotation")
-    (folder / "scene.json").write_text(json.dumps(scene))
+    for name, tree in (("camera", camera), ("objects", objects), ("scene", scene)):
+        (folder / f"{name}.json").write_text(json.dumps(tree))
     found = read_capture(folder)
     assert (found.bodies, found.people, found.touch, found.reference) == (None, None, None, None)
     assert found.scene.camera.R_cam_world.tolist() == np.diag([1.0, -1, -1]).tolist()
-    told = "\n".join(found.warnings)
+    said = "\n".join(found.warnings)
     for word in ("bodies.npz", "people.json", "reference.jpg", "annotation 5 without segm",
                  "(5 Stehlampe, 99 chair) without object", "'Lampe"):  # fmt: skip
-        assert word.strip("'") in told, (word, told)
+        assert word.strip("'") in said, (word, said)
 
 
 def test_what_scene_json_says_about_the_camera_wins(folder):
     other = tiny.camera(fl_x=70.0)
     del other["R_cam_world"]
-    edit(folder / "scene.json", camera=other)
+    (folder / "scene.json").write_text(json.dumps({**tiny.scene(), "camera": other}))
     camera = read_capture(folder).scene.camera
     assert float(camera.K[0, 0]) == 70
     assert float(pitch_roll(camera.R_cam_world)[0]) == pytest.approx(tiny.PITCH, abs=1e-6)
@@ -160,8 +152,7 @@ def test_a_heading_turns_the_world_and_leaves_the_view(folder):
     straight = read_capture(folder)
     # The same room in a world that is turned by -heading: same camera picture.
     heading, scene = 0.7, tiny.scene()
-    c, s = np.cos(heading), np.sin(heading)
-    ry = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    ry = np.diag([1.0, -1, -1]) @ tiny.rotation(0, 0, heading)
     for item in scene["objects"]:
         item["translation"] = (ry.T @ np.array(item["translation"])).tolist()
         item["yaw"] -= heading
@@ -176,46 +167,25 @@ def test_a_heading_turns_the_world_and_leaves_the_view(folder):
     found = read_capture(folder)
     assert float(found.scene.camera.R_cam_world[2, 0]) == pytest.approx(0, abs=1e-6)
     assert found.bodies.space == "camera"
-    wrapped = dataclasses.replace(
-        straight,
-        scene=dataclasses.replace(
-            straight.scene,
-            objects=tuple(
-                dataclasses.replace(p, yaw=torch.atan2(p.yaw.sin(), p.yaw.cos()))
-                for p in straight.scene.objects
-            ),
-        ),
-    )
-    close(wrapped, found)
+    turns = [replace(p, yaw=torch.atan2(p.yaw.sin(), p.yaw.cos())) for p in straight.scene.objects]
+    close(replace(straight, scene=replace(straight.scene, objects=tuple(turns))), found)
 
 
 def test_a_capture_is_not_mixed_with_what_lies_in_its_folder(folder):
-    capture = dataclasses.replace(read_capture(folder), people=None, reference_people=None)
+    capture = replace(read_capture(folder), people=None, reference_people=None)
     with pytest.raises(ValueError, match=r"has people.json, which the capture lacks"):
         write_capture(capture, folder)
 
 
-def test_truth_is_not_looked_at(folder):
-    (folder / "truth").mkdir()
-    (folder / "truth" / "scene.json").write_text("broken")
-    assert read_capture(folder).warnings == ()
-
-
-def test_an_unknown_format_names_the_choices():
-    with pytest.raises(ValueError, match=", ".join(sorted(names("capture")))):
-        read("prose", Path())
-
-
 def test_every_row_of_the_table_of_formats_has_a_function_and_a_name_of_its_own():
-    homes = [
-        *((kind,) for kind in ("capture", "people", "cameras", "keypoints", "export")),
-        IMPORTED,
-    ]
+    homes = [*(("capture",), ("people",), ("cameras",), ("keypoints",), ("export",)), IMPORTED]
     for kinds in homes:
         known = names(*kinds)
         assert len(known) == len(set(known)) > 0
         assert all(callable(chosen("it", name, *kinds)) for name in known)
     assert sum(len(names(*kinds)) for kinds in homes) == len(FORMATS)
+    with pytest.raises(ValueError, match=", ".join(sorted(names("capture")))):
+        read("prose", Path())
     with pytest.raises(InputError, match="--to: 'dwg' is none of glb, usd"):
         chosen("--to", "dwg", "export")
 
@@ -238,11 +208,3 @@ def test_a_real_photograph_is_read_without_a_word():
     mask = found.detections[0].mask
     assert mask is not None
     assert int(decode(mask, 0).sum()) == 41688  # COCO's own "area" in the file
-
-
-def test_a_capture_in_double_precision_is_written_too(folder, tmp_path):
-    double = map_tensors(lambda x: x.double() if x.is_floating_point() else x, read_capture(folder))
-    write_capture(double, tmp_path / "double")
-    found = read_capture(tmp_path / "double")
-    assert isinstance(found, Capture)
-    assert found.bodies.verts.dtype == torch.float32

@@ -6,10 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import make_scenes as layouts
 import numpy as np
 import pytest
 from PIL import Image
+from tiny_capture import compressed, runs
 
 from mover.core.errors import InputError
 from mover.core.types import Masks
@@ -35,7 +35,13 @@ def pixels(found: Instances) -> dict[tuple[int, int | None], np.ndarray]:
 
 
 def code(mask: np.ndarray) -> dict[str, Any]:
-    return {"size": [H, W], "counts": layouts.compressed(layouts.runs_of(mask))}
+    return {"size": [H, W], "counts": compressed(runs(mask))}
+
+
+def save(folder: Path, tree: Any) -> Path:
+    folder.mkdir(exist_ok=True)
+    (folder / "a.json").write_text(json.dumps(tree))
+    return folder / "a.json"
 
 
 def white(mask: np.ndarray) -> Image.Image:
@@ -62,11 +68,10 @@ def results(first: int) -> Callable[[Path], Path]:
     """A list of detections of COCO without those frames in which there is no person."""
 
     def write(folder: Path) -> Path:
-        rows = [{"image_id": k + first, "category_id": 1, "score": 0.9,
-                 "segmentation": code(walker(k))} for k in KEPT]  # fmt: skip
-        folder.mkdir()
-        (folder / "results.json").write_text(json.dumps(rows))
-        return folder / "results.json"
+        return save(folder, [
+            {"image_id": k + first, "category_id": 1, "score": 0.9, "segmentation": code(walker(k))}
+            for k in KEPT
+        ])  # fmt: skip
 
     return write
 
@@ -80,10 +85,7 @@ def coco(named: str, first: int) -> Callable[[Path], Path]:
         rows = [{"id": k, "image_id": k + first, "category_id": 3, "segmentation": code(walker(k))}
                 for k in KEPT]  # fmt: skip
         names = [{"id": 3, "name": "Person"}]
-        folder.mkdir()
-        tree = {"images": images, "annotations": rows, "categories": names}
-        (folder / "a.json").write_text(json.dumps(tree))
-        return folder / "a.json"
+        return save(folder, {"images": images, "annotations": rows, "categories": names})
 
     return write
 
@@ -132,7 +134,9 @@ VIDEOS = {  # how a walker is written, and his track
 @pytest.mark.parametrize("way", VIDEOS)
 def test_frames_keep_their_numbers_over_gaps_and_a_person_is_one_track(way, tmp_path):
     write, track = VIDEOS[way]
-    got = pixels(read_people(write(tmp_path / "in"), {}, None))
+    found = read_people(write(tmp_path / "in"), {}, None)
+    assert "coco" not in way or found.frames == set(range(8))  # also those without people
+    got = pixels(found)
     assert list(got) == [(frame, track) for frame in KEPT]
     for (frame, _), mask in got.items():
         off = (mask ^ walker(frame)).sum() / walker(frame).sum()
@@ -150,10 +154,6 @@ def test_what_is_decided_of_frames_and_tracks_is_said(way, said, tmp_path):
     assert any(said in note for note in notes), notes
 
 
-def test_frames_without_people_are_frames_that_were_looked_at(tmp_path):
-    assert read_people(coco("", 1)(tmp_path / "in"), {}, None).frames == set(range(8))
-
-
 @pytest.mark.parametrize("boxes", [True, False])
 def test_people_without_tracks_are_followed_by_place_not_by_score(boxes, tmp_path):
     """The one with the better score alternates, and so does their order (k34)."""
@@ -164,8 +164,7 @@ def test_people_without_tracks_are_followed_by_place_not_by_score(boxes, tmp_pat
                  "score": 0.9 if (j + k) % 2 else 0.8}
                 for j, start in ((0, 2), (1, 24))]  # fmt: skip
         rows += pair[:: 1 if k % 3 else -1]
-    (tmp_path / "a.json").write_text(json.dumps(rows))
-    got = pixels(read_people(tmp_path / "a.json", {}, None))
+    got = pixels(read_people(save(tmp_path, rows), {}, None))
     for k in range(12):
         assert (got[k, 0] == walker(0, 2)).all()
         assert (got[k, 1] == walker(k, 24)).all()
@@ -178,9 +177,7 @@ def test_a_stack_of_frames_is_a_person_and_one_of_apart_masks_are_people(tmp_pat
     np.save(tmp_path / "frames.npy", np.stack([walker(k) for k in range(6)])[:, None])
     got = pixels(read_people(tmp_path / "frames.npy", {}, None))
     assert list(got) == [(k, 0) for k in range(6)]
-    np.save(
-        tmp_path / "people.npy", np.stack([walker(0, 0), walker(0, 20), walker(0, 40)])[:, None]
-    )
+    np.save(tmp_path / "people.npy", np.stack([walker(0, k) for k in (0, 20, 40)])[:, None])
     found = read_people(tmp_path / "people.npy", {}, None)
     assert list(pixels(found)) == [(0, 0), (0, 1), (0, 2)]
     assert any("3 masks are people of one image" in note for note in found.notes)
@@ -195,8 +192,7 @@ def test_soft_labels_are_labels_and_a_dancer_is_a_person(tmp_path):
     found = read_things(folder, {"85": "chair", "170": "sofa"}, None)
     assert [i.category for i in found.items] == ["chair", "sofa"]
     rows = [{"class": "dancer", "bbox": [0, 0, 9, 9, 1.0], "mask": walker(0).tolist()}]
-    (tmp_path / "a.json").write_text(json.dumps(rows))
-    people = read_people(tmp_path / "a.json", {}, None)
+    people = read_people(save(tmp_path, rows), {}, None)
     assert len(people.items) == 1
     assert any("'dancer' taken as people's" in note for note in people.notes)
 
@@ -210,8 +206,7 @@ def grounded(folder: Path) -> Path:
            "segmentation": code(walker(0)), "score": [1.02]}  # fmt: skip
     tree = {"image_path": "notebooks/images/a.jpg", "annotations": [row], "box_format": "xyxy",
             "img_width": W, "img_height": H}  # fmt: skip
-    (folder / "a.json").write_text(json.dumps(tree))
-    return folder / "a.json"
+    return save(folder, tree)
 
 
 def mmdet(folder: Path) -> Path:
@@ -219,8 +214,7 @@ def mmdet(folder: Path) -> Path:
     tree = {"labels": [56, 0, 60], "scores": [0.9, 0.8, 0.05],
             "bboxes": [[4, 10, 18, 40], [0, 0, 9, 9], [0, 0, 5, 5]],
             "masks": [code(walker(0)), code(walker(3, 30)), code(walker(0, 9))]}  # fmt: skip
-    (folder / "a.json").write_text(json.dumps(tree))
-    return folder / "a.json"
+    return save(folder, tree)
 
 
 @pytest.mark.parametrize("write", [grounded, mmdet])
@@ -241,16 +235,14 @@ def many_images(folder: Path) -> Path:
     rows = [{"id": k, "image_id": k, "category_id": k, "segmentation": [[k, 0, 9, 0, 9, 9]],
              "bbox": [0, 0, 9, 9], "iscrowd": 0} for k in range(3)]  # fmt: skip
     names = [{"id": k, "name": name} for k, name in enumerate(("table", "chair", "bed"))]
-    tree = {"images": images, "annotations": rows, "categories": names}
-    (folder / "instances.json").write_text(json.dumps(tree))
-    return folder / "instances.json"
+    return save(folder, {"images": images, "annotations": rows, "categories": names})
 
 
 def test_of_many_images_only_ours_counts_and_this_is_said(tmp_path):
     path = many_images(tmp_path)
     found = read_things(path, {}, (W, H), "room.png")
     assert [i.category for i in found.items] == ["chair"]
-    assert found.notes == ("instances.json: of 3 images only images/Room.JPG is taken",)
+    assert found.notes == ("a.json: of 3 images only images/Room.JPG is taken",)
     with pytest.raises(InputError, match=r"3 images \(kitchen.jpg, .*expected one called x.png"):
         read_things(path, {}, (W, H), "x.png")
 
@@ -278,6 +270,5 @@ def test_a_box_without_mask_is_a_box(nothing, tmp_path):
            "segmentation": nothing}  # fmt: skip
     tree = {"images": [{"id": 0, "width": W, "height": H}], "annotations": [row],
             "categories": [{"id": 1, "name": "chair"}]}  # fmt: skip
-    (tmp_path / "a.json").write_text(json.dumps(tree))
-    (item,) = read_things(tmp_path / "a.json", {}, None).items
+    (item,) = read_things(save(tmp_path, tree), {}, None).items
     assert (item.box, item.mask) == ((4, 10, 18, 40), None)

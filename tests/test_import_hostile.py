@@ -10,8 +10,10 @@ from typing import Any
 import make_scenes as layouts
 import numpy as np
 import pytest
+import tiny_capture as tiny
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from kept_mats import mats_read_once as mats_read_once  # for every test
 
 from mover.core.errors import InputError
 from mover.io.capture.merge import import_into
@@ -22,49 +24,40 @@ from mover.io.masks.instance_files import read_instances
 
 SLOW = (HealthCheck.too_slow, HealthCheck.function_scoped_fixture)
 FUZZ = settings(max_examples=150, deadline=None, suppress_health_check=SLOW)
-STEP = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 0, 0.5]], dtype=float)
-FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3], [1, 4, 2]])
 AHEAD = np.array([0, 0, 3.0])
 JOINTS = np.tile(np.linspace(0, 1, 25)[:, None], (2, 1, 3)) + AHEAD
 
 
 def little() -> layouts.Room:
     things = [
-        layouts.Thing(f"{c}_{i}", c, STEP * 0.5, FACES, np.array([0.4 * i - 0.4, -1.4, -3.0]),
-                      0.3 * i, np.ones(3))
+        layouts.Thing(f"{c}_{i}", c, tiny.STEP * 0.5, tiny.STEP_FACES,
+                      np.array([0.4 * i - 0.4, -1.4, -3.0]), 0.3 * i, np.ones(3))
         for i, c in enumerate(("chair", "table"))
     ]  # fmt: skip
     K = np.array([[60.0, 0, 32], [0, 60.0, 24], [0, 0, 1]])
     return layouts.Room(K, np.diag([1.0, -1, -1]), (64, 48), -1.4, things)
 
 
-def camera() -> At:
-    fields = {"w": 64, "h": 48, "fl_x": 60.0, "fl_y": 60.0, "cx": 32.0, "cy": 24.0,
-              "R_cam_world": np.diag([1.0, -1, -1]).tolist()}  # fmt: skip
-    return At(fields, "camera.json")
-
-
 @pytest.fixture(scope="module")
-def sources():
-    room = little()
-    with tempfile.TemporaryDirectory() as place:
-        home = Path(place)
-        masks = np.zeros((2, 48, 64), dtype=bool)
-        masks[0, 5:20, 3:20], masks[1, 22:40, 30:50] = True, True
-        kinds = layouts.write_masks(home / "masks", masks, ["chair", "couch"])
-        found = {
-            "total3d": layouts.write_total3d(home / "t3d", room),
-            "sam3d": layouts.write_sam3d(home / "sam3d", room),
-            "holisticmesh": layouts.write_holisticmesh(home / "hm", room),
-            "glb": layouts.write_glb(home / "glb" / "a.glb", room),
-            "boxes": layouts.write_boxes(home / "boxes" / "a.json", room),
-            "release": layouts.write_release(
-                home / "rel", room, np.stack([STEP + AHEAD] * 2), FACES
-            ),
-            "pigraphs": layouts.write_pigraphs(home / "pig", room, "a_b_c", JOINTS, mirror=False),
-            **{f"masks:{k}": v for k, v in kinds.items()},
-        }
-        yield found
+def sources(tmp_path_factory):
+    room, home, steps = (
+        little(),
+        tmp_path_factory.mktemp("sources"),
+        np.stack([tiny.STEP + AHEAD] * 2),
+    )
+    masks = np.zeros((2, 48, 64), dtype=bool)
+    masks[0, 5:20, 3:20], masks[1, 22:40, 30:50] = True, True
+    kinds = layouts.write_masks(home / "masks", masks, ["chair", "couch"])
+    return {
+        "total3d": layouts.write_total3d(home / "t3d", room),
+        "sam3d": layouts.write_sam3d(home / "sam3d", room),
+        "holisticmesh": layouts.write_holisticmesh(home / "hm", room),
+        "glb": layouts.write_glb(home / "glb" / "a.glb", room),
+        "boxes": layouts.write_boxes(home / "boxes" / "a.json", room),
+        "release": layouts.write_release(home / "rel", room, steps, tiny.STEP_FACES),
+        "pigraphs": layouts.write_pigraphs(home / "pig", room, "a_b_c", JOINTS, mirror=False),
+        **{f"masks:{k}": v for k, v in kinds.items()},
+    }
 
 
 def import_or_refuse(format: str, source: Path, home: Path) -> bool:
@@ -75,7 +68,8 @@ def import_or_refuse(format: str, source: Path, home: Path) -> bool:
     work.mkdir(parents=True)
     before = sorted(p for p in home.rglob("*") if not p.is_relative_to(work))
     try:
-        hints = Hints(work=work, camera=None if format == "total3d" else camera())
+        camera = At(layouts.camera_json(little()), "camera.json")
+        hints = Hints(work=work, camera=None if format == "total3d" else camera)
         import_into(out, chosen("FORMAT", format.split(":")[0], *IMPORTED)(source, hints))
     except InputError as error:
         assert str(error)  # noqa: PT017
@@ -89,11 +83,8 @@ def import_or_refuse(format: str, source: Path, home: Path) -> bool:
 def copied(source: Path, home: Path) -> Path:
     """The source's folder in a new place; the same path in it."""
     shutil.rmtree(home, ignore_errors=True)
-    if source.is_dir():
-        shutil.copytree(source, home / "in")
-        return home / "in"
-    shutil.copytree(source.parent, home / "in")
-    return home / "in" / source.name
+    folder = source if source.is_dir() else source.parent
+    return shutil.copytree(folder, home / "in") / source.relative_to(folder)
 
 
 FORMATS = ("total3d", "sam3d", "holisticmesh", "glb", "boxes", "release", "pigraphs",
@@ -143,10 +134,8 @@ JUNK = st.recursive(
 def ways_of(tree: Any, way: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     """The place of every value in nested lists and objects; long lists at their ends only."""
     found = [way] if way else []
-    keys: Any = ()
-    if isinstance(tree, dict):
-        keys = tree
-    elif isinstance(tree, list):
+    keys: Any = tree if isinstance(tree, dict) else ()
+    if isinstance(tree, list):
         keys = range(len(tree)) if len(tree) < 30 else (0, len(tree) - 1)
     for key in keys:
         found += ways_of(tree[key], (*way, key))
@@ -169,14 +158,7 @@ def test_no_junk_in_any_json_field_raises_anything_else(sources, format, which, 
         path = paths[which % len(paths)]
         tree = json.loads(path.read_text())
         ways = ways_of(tree)
-        *way, last = ways[which % len(ways)]
-        inner = tree
-        for key in way:
-            inner = inner[key]
-        if value is ...:
-            del inner[last]
-        else:
-            inner[last] = value
+        tiny.put(tree, ways[which % len(ways)], value)
         path.write_text(json.dumps(tree, default=str))
         import_or_refuse(format, source, home)
 
@@ -195,10 +177,7 @@ def test_pickles_in_arrays_do_not_run(tmp_path):
 def test_zip_bombs_are_not_unpacked(tmp_path):
     with pytest.raises(InputError, match="bytes"):
         read_instances(layouts.write_zip_bomb(tmp_path / "a.npz"), {}, None)
-    head = str({"descr": "<f8", "fortran_order": False, "shape": (10**9, 3)}).encode()
-    head += b" " * (-(len(head) + 11) % 64) + b"\n"
-    body = b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head
-    (tmp_path / "b.npy").write_bytes(body + b"\0" * 100)
+    (tmp_path / "b.npy").write_bytes(layouts.promise(10**9, 3) + b"\0" * 100)
     with pytest.raises(InputError, match=r"b\.npy"):
         read_instances(tmp_path / "b.npy", {}, None)
 
@@ -238,16 +217,8 @@ def test_a_gltf_cannot_bring_other_files_along(tmp_path):
     secret = tmp_path / "secret.png"
     layouts.picture((8, 8)).save(secret)
     path = layouts.write_glb(tmp_path / "in" / "a.glb", little())
-    content = path.read_bytes()
-    size = int.from_bytes(content[12:16], "little")
-    tree = json.loads(content[20 : 20 + size])
-    tree["images"] = [{"uri": "../secret.png"}]
-    chunk = json.dumps(tree).encode()
-    chunk += b" " * (-len(chunk) % 4)
-    body = content[20 + size :]
-    total = (20 + len(chunk) + len(body)).to_bytes(4, "little")
-    head = content[:8] + total + len(chunk).to_bytes(4, "little") + b"JSON"
-    path.write_bytes(head + chunk + body)
+    images = {"images": [{"uri": "../secret.png"}]}
+    path.write_bytes(layouts.with_json(path.read_bytes(), lambda tree: tree.update(images)))
     with pytest.raises(InputError, match="images beside it"):
         chosen("FORMAT", "glb", *IMPORTED)(path, Hints(work=tmp_path))
 

@@ -2,25 +2,28 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import make_scenes as layouts
 import numpy as np
 import pytest
 import torch
+from kept_mats import mats_read_once as mats_read_once  # for every test
 from PIL import Image
-from test_import_scenes import camera_at, capture_of, imported
+from test_import_scenes import camera_at, capture_of
 from test_import_scenes import plain as plain  # the fixture
 
 from mover.app.cli.imports import ImportArgs, run_import
 from mover.core.errors import InputError
-from mover.core.types import Masks
+from mover.core.types import Capture, Masks
+from mover.geometry.boxes import box_of
+from mover.geometry.camera import to_camera
 from mover.geometry.rle import decode
 from mover.io.capture.folder import read_capture
 from mover.io.capture.merge import import_into
 from mover.io.capture.parts import Parts
-from mover.io.files.fields import At
-from mover.io.masks.instance_files import list_instances, read_instances
-from mover.io.masks.instances import fitted
+from mover.io.masks.instance_files import read_instances
+from mover.io.masks.instances import Instance, fitted
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 WORDS = ["chair", "couch", "chair", "person"]
@@ -43,16 +46,18 @@ def drawn() -> np.ndarray:
     return masks
 
 
+def drawn_of(item: Instance, height: int = 48, width: int = 64) -> np.ndarray:
+    assert item.mask is not None
+    return decode(Masks(height, width, (item.mask,)), 0).numpy()
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_layout_gives_the_same_masks(tmp_path, kind):
     masks = drawn()
     files = layouts.write_masks(tmp_path / "in", masks, WORDS)
     found = read_instances(files[kind], {}, None)
     assert found.size == (64, 48)
-    got = {}
-    for item in found.items:
-        assert item.mask is not None
-        got[decode(Masks(48, 64, (item.mask,)), 0).numpy().tobytes()] = item.category
+    got = {drawn_of(item).tobytes(): item.category for item in found.items}
     assert set(got) == {m.tobytes() for m in masks}
     words = [got[m.tobytes()] for m in masks]
     assert words == (["object"] * 4 if kind in NAMELESS else WORDS)
@@ -64,9 +69,7 @@ def test_polygons_fill_what_they_surround(tmp_path):
     tree = {"images": [{"id": 1, "width": 64, "height": 48}], "annotations": [row],
             "categories": [{"id": 1, "name": "bed"}]}  # fmt: skip
     (tmp_path / "a.json").write_text(json.dumps(tree))
-    found = read_instances(tmp_path / "a.json", {}, None).items[0]
-    assert found.mask is not None
-    mask = decode(Masks(48, 64, (found.mask,)), 0).numpy()
+    mask = drawn_of(read_instances(tmp_path / "a.json", {}, None).items[0])
     assert mask[10:25, 10:30].all()
     assert mask.sum() == 300
 
@@ -84,9 +87,7 @@ def test_shapes_of_labelme_are_filled_and_those_of_a_group_are_one(tmp_path):
     truth = np.zeros((3, 48, 64), dtype=bool)
     truth[0, 10:25, 10:30] = truth[0, 10:14, 40:44] = True
     truth[1, 30:40, 45:50] = truth[2, 30:34, 0:8] = True
-    for item, mask in zip(found.items, truth, strict=True):
-        assert item.mask is not None
-        assert (decode(Masks(48, 64, (item.mask,)), 0).numpy() == mask).all()
+    assert (np.stack([drawn_of(item) for item in found.items]) == truth).all()
     bad = layouts.write_labelme(tmp_path / "b.json", [("chair", [[1, 1], [9, 9]], "line", None)])
     with pytest.raises(InputError, match=r"shapes\[0\]\.shape_type.*polygon, rectangle"):
         read_instances(bad, {}, None)
@@ -103,45 +104,26 @@ def test_names_of_the_user_win(tmp_path):
 def test_masks_of_another_size_are_stretched_and_of_another_shape_refused(tmp_path):
     files = layouts.write_masks(tmp_path / "in", drawn(), WORDS)
     found = fitted(read_instances(files["npz"], {}, None), (128, 96))
-    assert found.items[0].mask is not None
-    mask = decode(Masks(96, 128, (found.items[0].mask,)), 0).numpy()
+    mask = drawn_of(found.items[0], 96, 128)
     assert (mask == np.kron(drawn()[0], np.ones((2, 2), dtype=bool))).all()
     with pytest.raises(InputError, match="64 x 48"):
         fitted(read_instances(files["npz"], {}, None), (128, 128))
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the shared data is not here")
-class TestRealFiles:
-    def test_real_results_of_coco_have_their_runs(self):
-        path = DATA / "formats" / "coco_instances_val2014_fakesegm100_results.json"
-        rows = [row for row in json.loads(path.read_text()) if row["image_id"] == 42]
-        found = list_instances(At(rows, path.name), {}, None).items
-        assert len(found) == len(rows)
-        for item, row in zip(found, rows, strict=True):
-            height, width = row["segmentation"]["size"]
-            assert item.mask is not None
-            mask = decode(Masks(height, width, (item.mask,)), 0).numpy()
-            assert layouts.compressed(layouts.runs_of(mask)) == row["segmentation"]["counts"]
-        assert found[0].category == "dog"
-
-    def test_real_total3d_and_masks_of_its_boxes_become_one_capture(self, tmp_path):
-        rows = json.loads((DATA / "total3d_1" / "input" / "detections.json").read_text())
-        masks = np.zeros((len(rows), 530, 730), dtype=bool)
-        for mask, row in zip(masks, rows, strict=True):
-            x0, y0, x1, y1 = (round(v) for v in row["bbox"])
-            mask[max(y0, 0) + 2 : y1 - 2, max(x0, 0) + 2 : x1 - 2] = True
-        np.savez(tmp_path / "masks.npz", masks=masks[::-1])
-        args = ImportArgs(
-            "total3d", DATA / "total3d_1", tmp_path / "out", objects_masks=tmp_path / "masks.npz"
-        )
-        run_import(args, tmp_path)
-        found = read_capture(tmp_path / "out")
-        known = {d.id: d for d in found.detections}
-        assert [p.annotation for p in found.scene.objects] == list(range(18))
-        for i, mask in enumerate(masks):
-            code = known[i].mask
-            assert code is not None
-            assert (decode(code, 0).numpy() == mask).all()
+def test_real_total3d_and_masks_of_its_boxes_become_one_capture(tmp_path):
+    rows = json.loads((DATA / "total3d_1" / "input" / "detections.json").read_text())
+    masks = np.zeros((len(rows), 530, 730), dtype=bool)
+    for mask, row in zip(masks, rows, strict=True):
+        x0, y0, x1, y1 = (round(v) for v in row["bbox"])
+        mask[max(y0, 0) + 2 : y1 - 2, max(x0, 0) + 2 : x1 - 2] = True
+    np.savez(tmp_path / "masks.npz", masks=masks[::-1])
+    masks_file = tmp_path / "masks.npz"
+    found = command(tmp_path, "total3d", DATA / "total3d_1", objects_masks=masks_file)
+    known = {d.id: d for d in found.detections}
+    assert [p.annotation for p in found.scene.objects] == list(range(18))
+    for i, mask in enumerate(masks):
+        assert (decode(known[i].mask, 0).numpy() == mask).all()
 
 
 def of_boxes(room: layouts.Room, things: list[layouts.Thing], path: Path, **more: object) -> Path:
@@ -153,6 +135,16 @@ def of_boxes(room: layouts.Room, things: list[layouts.Thing], path: Path, **more
         mask[y0:y1, x0:x1] = True
     np.savez(path, masks=masks, **more)  # pyright: ignore[reportArgumentType]
     return path
+
+
+def command(home: Path, kind: str, source: Path, **given: Any) -> Capture:
+    """What `mover import` leaves in out/."""
+    run_import(ImportArgs(kind, source, home / "out", **given), home)
+    return read_capture(home / "out")
+
+
+def files_in(folder: Path) -> dict[Path, bytes]:
+    return {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 def test_parts_come_in_any_order_and_stay(plain, tmp_path):
@@ -181,12 +173,9 @@ def test_parts_come_in_any_order_and_stay(plain, tmp_path):
 def test_a_scene_without_annotations_finds_its_masks(plain, tmp_path):
     source = layouts.write_glb(tmp_path / "in.glb", plain)
     layouts.picture(plain.size).save(tmp_path / "photo.png")
-    args = ImportArgs(
-        "glb", source, tmp_path / "out", image=tmp_path / "photo.png",
-        objects_masks=of_boxes(plain, plain.things[::-1], tmp_path / "masks.npz"),
-    )  # fmt: skip
-    run_import(args, tmp_path)
-    found = read_capture(tmp_path / "out")
+    masks = of_boxes(plain, plain.things[::-1], tmp_path / "masks.npz")
+    image = tmp_path / "photo.png"
+    found = command(tmp_path, "glb", source, image=image, objects_masks=masks)
     order = [t.name for t in plain.things[::-1]]
     assert {p.id: p.annotation for p in found.scene.objects} == {n: i for i, n in enumerate(order)}
 
@@ -194,21 +183,14 @@ def test_a_scene_without_annotations_finds_its_masks(plain, tmp_path):
 def test_a_new_tilt_keeps_box_centres_in_the_camera(plain, tmp_path):
     source = layouts.write_total3d(tmp_path / "in", plain)
     first = capture_of("total3d", source, tmp_path)
-    camera = {**camera_at(plain).value}
-    del camera["R_cam_world"]
-    tilted = {**camera, "R_cam_world": np.diag([1.0, -1, -1]).tolist()}
+    tilted = {**camera_at(plain).value, "R_cam_world": layouts.FLIP.tolist()}
     (tmp_path / "level.json").write_text(json.dumps(tilted))
-    args = ImportArgs("folder", tmp_path / "out", tmp_path / "out", camera=tmp_path / "level.json")
-    run_import(args, tmp_path)
-    second = read_capture(tmp_path / "out")
-    from mover.geometry.boxes import box_of
-    from mover.geometry.camera import to_camera
-
+    second = command(tmp_path, "folder", tmp_path / "out", camera=tmp_path / "level.json")
     for a, b in zip(first.scene.objects, second.scene.objects, strict=True):
         before = to_camera(box_of(a).center, first.scene.camera.R_cam_world)
         after = to_camera(box_of(b).center, second.scene.camera.R_cam_world)
         assert torch.allclose(before, after, atol=1e-4)
-    assert second.scene.camera.R_cam_world.tolist() == np.diag([1.0, -1, -1]).tolist()
+    assert second.scene.camera.R_cam_world.tolist() == layouts.FLIP.tolist()
 
 
 @pytest.mark.parametrize("tracks", [[4, 9], [4]])
@@ -220,11 +202,8 @@ def test_people_keep_their_tracks_and_frames(plain, tmp_path, tracks):
         stack[frame, 0, 10:50, 10 + frame : 30 + frame] = True
         stack[frame, 1:, 60:90, 40:60] = frame != 1
     np.savez(tmp_path / "people.npz", masks=stack, object_ids=np.array(tracks))
-    source, out = layouts.write_total3d(tmp_path / "in", plain), tmp_path / "out"
-    run_import(
-        ImportArgs("total3d", source, out, people_masks=tmp_path / "people.npz", fps=5.0), tmp_path
-    )
-    people = read_capture(out).people
+    source, masks = layouts.write_total3d(tmp_path / "in", plain), tmp_path / "people.npz"
+    people = command(tmp_path, "total3d", source, people_masks=masks, fps=5.0).people
     rows = list(zip(people.frame.tolist(), people.person.tolist(), strict=True))
     every = [(frame, track) for frame in range(3) for track in tracks]
     assert rows == [row for row in every if row != (1, 9)]
@@ -243,21 +222,13 @@ def test_masks_alone_make_a_part_and_what_is_missing_is_said(tmp_path, capsys):
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["objects.json"]
 
 
-def test_nothing_is_written_when_a_part_does_not_fit(plain, tmp_path):
+def test_nothing_is_written_when_a_part_does_not_fit_or_there_is_none(plain, tmp_path):
+    out = tmp_path / "out"
     capture_of("total3d", layouts.write_total3d(tmp_path / "in", plain), tmp_path)
-    before = {p: p.read_bytes() for p in (tmp_path / "out").rglob("*") if p.is_file()}
+    before = files_in(out)
     Image.new("RGB", (10, 10)).save(tmp_path / "small.png")
     with pytest.raises(InputError, match="10 x 10"):
-        run_import(
-            ImportArgs("folder", tmp_path / "out", tmp_path / "out", image=tmp_path / "small.png"),
-            tmp_path,
-        )
-    after = {p: p.read_bytes() for p in (tmp_path / "out").rglob("*") if p.is_file()}
-    assert before == after
-
-
-def test_an_empty_import_changes_nothing(plain, tmp_path):
-    imported("total3d", layouts.write_total3d(tmp_path / "in", plain), tmp_path / "out", tmp_path)
-    before = {p: p.read_bytes() for p in (tmp_path / "out").rglob("*.json")}
-    import_into(tmp_path / "out", Parts(name="nothing"))
-    assert before == {p: p.read_bytes() for p in (tmp_path / "out").rglob("*.json")}
+        command(tmp_path, "folder", out, image=tmp_path / "small.png")
+    assert files_in(out) == before
+    import_into(out, Parts(name="nothing"))
+    assert files_in(out) == before

@@ -1,8 +1,8 @@
 """A known room in the layout of every tool comes back as the same room."""
 
-import dataclasses
 import json
 import math
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,16 +11,18 @@ import make_scenes as layouts
 import numpy as np
 import pytest
 import torch
+from kept_mats import mats_read_once as mats_read_once  # for every test
 
 from mover.core.errors import InputError
 from mover.core.types import Capture
-from mover.geometry.boxes import box_of, iou3d
+from mover.geometry.boxes import Box, box_of, iou3d
 from mover.geometry.camera import pitch_roll
 from mover.geometry.placement import place_object
 from mover.io.capture.faults import check_against_picture
 from mover.io.capture.folder import read_capture
 from mover.io.capture.merge import Imported, import_into
 from mover.io.capture.parts import Hints
+from mover.io.capture.scene_file import read_scene
 from mover.io.files.fields import At
 from mover.io.formats import IMPORTED, chosen
 
@@ -68,12 +70,8 @@ def capture_of(format: str, source: Path, tmp: Path, **hints: object) -> Capture
 def worst(found: Capture, room: layouts.Room) -> float:
     """Largest distance between the vertices of an object and the true ones [m]."""
     assert len(found.scene.objects) == len(room.things)
-    gaps = []
-    for piece, thing in zip(found.scene.objects, room.things, strict=True):
-        verts = place_object(piece).verts.double().numpy()
-        assert verts.shape == thing.verts.shape
-        gaps.append(np.abs(verts - thing.world).max())
-    return float(max(gaps))
+    pairs = zip(found.scene.objects, room.things, strict=True)
+    return max(np.abs(place_object(p).verts.double().numpy() - t.world).max() for p, t in pairs)
 
 
 def tilt_error(R: torch.Tensor, room: layouts.Room) -> float:
@@ -82,9 +80,7 @@ def tilt_error(R: torch.Tensor, room: layouts.Room) -> float:
 
 
 def camera_at(room: layouts.Room) -> At:
-    fields = {"w": room.size[0], "h": room.size[1], "fl_x": room.K[0, 0], "fl_y": room.K[1, 1],
-              "cx": room.K[0, 2], "cy": room.K[1, 2], "R_cam_world": room.R.tolist()}  # fmt: skip
-    return At(fields, "camera")
+    return At(layouts.camera_json(room), "camera")
 
 
 def lens_at(room: layouts.Room) -> At:
@@ -120,59 +116,49 @@ def test_a_known_room_comes_back(plain, tmp_path, case):
 
 
 def test_total3d_numbers_are_numbers_not_words(plain, tmp_path):
-    many = dataclasses.replace(plain, things=[plain.things[i % 4] for i in range(12)])
-    moved = [
-        dataclasses.replace(t, t=t.t + np.array([0.01 * i, 0, 0]))
-        for i, t in enumerate(many.things)
-    ]
-    many = dataclasses.replace(many, things=moved)
+    twelve = [(plain.things[i % 4], np.array([0.01 * i, 0, 0])) for i in range(12)]
+    many = replace(plain, things=[replace(t, t=t.t + shift) for t, shift in twelve])
     source = layouts.write_total3d(tmp_path / "in", many)
     assert worst(capture_of("total3d", source, tmp_path), many) < FINE
 
 
-def test_holisticmesh_without_a_camera_is_level_under_the_lens_of_prox(plain, tmp_path):
+def test_holisticmesh_without_a_camera_is_under_the_lens_of_prox_and_what_it_lacks_is_said(
+    plain, tmp_path
+):
     source = layouts.write_holisticmesh(tmp_path / "in", plain)
     found = imported("holisticmesh", source, tmp_path / "out", tmp_path / "work")
     assert any("the camera is level" in note for note in found.notes)
     camera = read_capture(tmp_path / "out").scene.camera
     assert float(camera.K[0, 0]) == pytest.approx(1060.5317)
     assert (camera.width, camera.height) == (1920, 1080)
-
-
-def test_what_holisticmesh_lacks_is_said(plain, tmp_path):
-    source = layouts.write_holisticmesh(tmp_path / "in", plain)
-    rows = json.loads((source / "detections.json").read_text())
-    (source / "detections.json").write_text(json.dumps(rows[:-1]))
-    with pytest.raises(InputError, match=f"expected as many vertices for each of {len(rows) - 1}"):
-        imported("holisticmesh", source, tmp_path / "out", tmp_path)
-    (source / "detections.json").unlink()
-    with pytest.raises(InputError, match=r"detections\.json: there is no such file"):
-        imported("holisticmesh", source, tmp_path / "out", tmp_path)
-    (source / "models" / "scene.ply").unlink()
-    with pytest.raises(InputError, match=r"models/scene\.ply: there is no such file"):
-        imported("holisticmesh", source, tmp_path / "out", tmp_path)
+    detections, meshes = source / "detections.json", source / "models" / "scene.ply"
+    rows = json.loads(detections.read_text())
+    for change, words in (
+        (lambda: detections.write_text(json.dumps(rows[:-1])),
+         f"expected as many vertices for each of {len(rows) - 1}"),
+        (detections.unlink, r"detections\.json: there is no such file"),
+        (meshes.unlink, r"models/scene\.ply: there is no such file"),
+    ):  # fmt: skip
+        change()
+        with pytest.raises(InputError, match=words):
+            imported("holisticmesh", source, tmp_path / "out", tmp_path)
 
 
 @pytest.mark.parametrize("up", ["y", "-y", "z"])
 @pytest.mark.parametrize("camera", [True, False])
 def test_a_gltf_scene_gives_the_room_back_whichever_way_is_up(plain, tmp_path, up, camera):
     turns = {"y": np.eye(3), "-y": layouts.FLIP, "z": layouts.Z_UP}
-    world = np.eye(4)
-    world[:3, :3] = turns[up]
-    if camera:
-        world[:3, 3] = [0.5, -2, 3]
+    world = layouts.four(turns[up], [0.5, -2, 3] if camera else [0, 0, 0])
     source = layouts.write_glb(tmp_path / "in.glb", plain, world, camera)
     given = {} if camera else {"camera": camera_at(plain)}
     found = capture_of("glb", source, tmp_path, up=up, **given)
     order = {p.id: p for p in found.scene.objects}
     pieces = tuple(order[t.name] for t in plain.things)
-    found = dataclasses.replace(found, scene=dataclasses.replace(found.scene, objects=pieces))
+    found = replace(found, scene=replace(found.scene, objects=pieces))
     assert worst(found, plain) < FINE
     assert tilt_error(found.scene.camera.R_cam_world, plain) < FINE
-    assert all(
-        float(p.scale[0]) == pytest.approx(t.scale[0], abs=1e-5)
-        for p, t in zip(pieces, plain.things, strict=True)
-    )
+    scales = [float(t.scale[0]) for t in plain.things]
+    assert [float(p.scale[0]) for p in pieces] == pytest.approx(scales, abs=1e-5)
 
 
 @pytest.mark.parametrize("frame", ["y", "-y", "z", "camera"])
@@ -182,48 +168,21 @@ def test_boxes_come_back_with_furniture_of_their_class(plain, tmp_path, frame):
     assert tilt_error(found.scene.camera.R_cam_world, plain) < FINE
     for piece, thing in zip(found.scene.objects, plain.things, strict=True):
         mine = box_of(piece)
-        low, high = thing.verts.min(0), thing.verts.max(0)
-        centre = layouts.about_y(thing.yaw) @ (thing.scale * (low + high) / 2) + thing.t
-        assert np.allclose(mine.center.numpy(), centre, atol=FINE)
-        assert np.allclose(mine.size.numpy(), thing.scale * (high - low), atol=FINE)
+        assert np.allclose(mine.center.numpy(), thing.centre, atol=FINE)
+        assert np.allclose(mine.size.numpy(), thing.size, atol=FINE)
         assert math.cos(float(piece.yaw) - thing.yaw) == pytest.approx(1, abs=1e-6)
         assert len(piece.mesh.faces) > 12
     assert all(p.annotation is not None for p in found.scene.objects)
 
 
-@pytest.mark.parametrize(("turn", "word"), [
-    (np.diag([-1.0, 1, 1]), "mirrored"),
-    (np.diag([1.0, -1, -1]), "upside down"),
-    (layouts.Z_UP, "its side"),
-])  # fmt: skip
-def test_a_scene_in_another_world_is_named(plain, tmp_path, turn, word):
-    world = np.eye(4)
-    world[:3, :3] = turn
-    right = layouts.write_total3d(tmp_path / "t3d", plain)
-    detections = capture_of("total3d", right, tmp_path / "a").detections
-    boxes = {t.name: d.box for t, d in zip(plain.things, detections, strict=True)}
-    source = layouts.write_glb(tmp_path / "in.glb", plain, world, camera=False)
-    found = capture_of("glb", source, tmp_path / "b", camera=camera_at(plain))
-    pieces = tuple(dataclasses.replace(p, annotation=i) for i, p in enumerate(found.scene.objects))
-    seen = tuple(
-        dataclasses.replace(detections[0], id=i, box=boxes[p.id]) for i, p in enumerate(pieces)
-    )
-    scene = dataclasses.replace(found.scene, objects=pieces)
-    said = check_against_picture(dataclasses.replace(found, scene=scene, detections=seen)).warnings
-    assert word in said[0]
-
-
 def test_a_tilted_object_stands_upright_about_its_centre(plain, tmp_path):
-    world = np.eye(4)
-    world[:3, :3] = layouts.Rotation.from_euler("x", 8, degrees=True).as_matrix()
-    source = layouts.write_glb(tmp_path / "in.glb", plain, world, camera=False)
+    tilt = layouts.Rotation.from_euler("x", 8, degrees=True).as_matrix()
+    source = layouts.write_glb(tmp_path / "in.glb", plain, layouts.four(tilt), camera=False)
     result = imported("glb", source, tmp_path / "out", tmp_path, camera=camera_at(plain))
     assert sum("a tilt of" in note for note in result.notes) == len(plain.things)
+    centres = {t.name: tilt @ t.centre for t in plain.things}
     for piece in result.capture.scene.objects:
-        thing = next(t for t in plain.things if t.name == piece.id)
-        low, high = thing.verts.min(0), thing.verts.max(0)
-        centre = layouts.about_y(thing.yaw) @ (thing.scale * (low + high) / 2) + thing.t
-        assert np.allclose(box_of(piece).center.numpy(), world[:3, :3] @ centre, atol=FINE)
+        assert np.allclose(box_of(piece).center.numpy(), centres[piece.id], atol=FINE)
 
 
 def test_the_release_of_the_authors_comes_back_with_their_result_and_the_truth(plain, tmp_path):
@@ -239,8 +198,6 @@ def test_the_release_of_the_authors_comes_back_with_their_result_and_the_truth(p
     assert found.touch[:, 0].tolist() == [0, 0.25, 0.5, 0.75]
     assert sorted(p.name for p in (tmp_path / "out" / "frames").iterdir())[0] == "000000.jpg"
     check_truth(tmp_path / "out" / "truth", plain)
-    from mover.io.capture.scene_file import read_scene
-
     authors = read_scene(tmp_path / "out" / "authors" / "scene.json")
     for piece, thing in zip(authors.objects, plain.things, strict=True):
         assert np.abs(place_object(piece).verts.numpy() - thing.world).max() < FINE
@@ -248,30 +205,19 @@ def test_the_release_of_the_authors_comes_back_with_their_result_and_the_truth(p
 
 def check_truth(folder: Path, plain: layouts.Room) -> None:
     """True boxes are those of the room, and so is its floor."""
-    from mover.io.capture.scene_file import read_scene
-
     truth = read_scene(folder / "scene.json")
     assert truth.ground == pytest.approx(plain.ground, abs=0.02)
     assert tilt_error(truth.camera.R_cam_world, plain) < FINE
-    known = {t.name: t for t in plain.things}
-    assert len(truth.objects) == len(known)
     for piece, thing in zip(truth.objects, plain.things, strict=True):
-        low, high = thing.verts.min(0), thing.verts.max(0)
-        size = torch.from_numpy(thing.scale * (high - low)).float()
-        centre = layouts.about_y(thing.yaw) @ (thing.scale * (low + high) / 2) + thing.t
-        mine = box_of(piece)
-        true = type(mine)(torch.from_numpy(centre).float(), size, torch.tensor(thing.yaw).float())
-        assert float(iou3d(mine, true)) > 1 - COARSE
+        true = Box(*(torch.tensor(v).float() for v in (thing.centre, thing.size, thing.yaw)))
+        assert float(iou3d(box_of(piece), true)) > 1 - COARSE
 
 
-def test_a_scene_needs_a_camera(plain, tmp_path):
+def test_a_scene_needs_a_camera_and_a_mesh_a_pose(plain, tmp_path):
     source = layouts.write_glb(tmp_path / "in.glb", plain, camera=False)
     with pytest.raises(InputError, match="--camera"):
         imported("glb", source, tmp_path / "out", tmp_path)
     assert not (tmp_path / "out").exists()
-
-
-def test_a_mesh_without_pose_in_its_own_frame_is_refused(plain, tmp_path):
     source = layouts.write_sam3d(tmp_path / "in", plain)
     (source / "1.npz").unlink()
     with pytest.raises(InputError, match=r"1\.npz or 1\.json"):

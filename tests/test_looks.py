@@ -5,9 +5,10 @@ import struct
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
+import trimesh
 from PIL import Image
+from test_export import textured as textured_box
 
 from mover.core.errors import InputError
 from mover.io.files.fields import At
@@ -48,8 +49,12 @@ def textured(folder: Path, line: str, file: str | None, library: str = "mtllib a
     return folder / "a.obj"
 
 
+def parts_of(path: Path) -> Any:
+    return load_parts(At(path.name, "here"), path)
+
+
 def colour_of(path: Path) -> Any:
-    (part,) = load_parts(At(path.name, "here"), path).geometry.values()
+    (part,) = parts_of(path).geometry.values()
     image = getattr(part.visual.material, "image", None)
     return None if image is None else image.convert("RGB").getpixel((0, 0))
 
@@ -71,29 +76,20 @@ def test_a_texture_is_found_as_people_name_it_and_goes_along(way, tmp_path):
 def test_what_is_lost_of_the_looks_is_said(line, library, said, tmp_path):
     path = textured(tmp_path, line, "wood.png", library)
     assert said in looks_lost(path)
-    assert len(load_parts(At(path.name, "here"), path).to_mesh().faces) == 2
+    assert len(parts_of(path).to_mesh().faces) == 2
 
 
 def test_pictures_of_a_gltf_are_found_in_any_case(tmp_path):
-    import trimesh
-    from trimesh.visual import TextureVisuals
-    from trimesh.visual.material import PBRMaterial
-
-    part = trimesh.creation.box()
-    uv = np.zeros((len(part.vertices), 2))
-    look = PBRMaterial(baseColorTexture=Image.new("RGB", (2, 2), RED))
-    part.visual = TextureVisuals(uv=uv, material=look)
-    files: Any = trimesh.Scene(part).export(file_type="gltf")
+    files: Any = trimesh.Scene(textured_box()).export(file_type="gltf")
     for name, content in files.items():
         (tmp_path / name).write_bytes(content)
     path = tmp_path / "model.gltf"
     tree = json.loads(path.read_text())
-    (picture,) = (i for i in tree["images"])
-    picture.clear()
-    picture["uri"] = "textures\\wood.PNG"
+    assert len(tree["images"]) == 1
+    tree["images"] = [{"uri": "textures\\wood.PNG"}]
     Image.new("RGB", (2, 2), RED).save(tmp_path / "Wood.png")
     path.write_text(json.dumps(tree))
-    (loaded,) = load_parts(At(path.name, "here"), path).geometry.values()
+    (loaded,) = parts_of(path).geometry.values()
     assert loaded.visual.material.baseColorTexture.getpixel((0, 0)) == RED
     assert Path("Wood.png") in companions(path)
     (tmp_path / "Wood.png").unlink()
@@ -108,24 +104,22 @@ def test_groups_materials_and_indices_from_the_end_are_one_mesh(tmp_path):
     (tmp_path / "many.mtl").write_text("".join(f"newmtl m{i}\nKd 1 0 0\n" for i in range(3000)))
     verts, faces = load_arrays(At(path.name, "here"), path)
     assert verts[faces].tolist() == [[[i, 0, 0], [i, 1, 0], [i, 0, 1]] for i in range(3000)]
-    assert len(load_parts(At(path.name, "here"), path).to_mesh().faces) == 3000
+    assert len(parts_of(path).to_mesh().faces) == 3000
     assert "3000 materials" in looks_lost(path)
 
 
-@pytest.mark.parametrize("kind", ["off", "stl", "ply"])
-def test_a_byte_that_is_not_utf_8_does_not_matter(kind, tmp_path):
-    import trimesh
+REMARKS = {  # how the file is written, and what becomes of its first mark
+    "off": ({"file_type": "off"}, b"\n", b"\n# M\xf6bel\n"),
+    "stl": ({"file_type": "stl_ascii"}, b"\n", b" M\xf6bel\n"),
+    "ply": ({"file_type": "ply", "encoding": "ascii"}, b"element", b"comment M\xf6bel\nelement"),
+}
 
-    path = tmp_path / f"a.{kind}"
-    whole: Any = trimesh.creation.box().export(
-        file_type="stl_ascii" if kind == "stl" else kind,
-        **({"encoding": "ascii"} if kind == "ply" else {}),
-    )
+
+@pytest.mark.parametrize("kind", REMARKS)
+def test_a_byte_that_is_not_utf_8_does_not_matter(kind, tmp_path):
+    path, (options, mark, word) = tmp_path / f"a.{kind}", REMARKS[kind]
+    whole: Any = trimesh.creation.box().export(**options)
     content = whole.encode() if isinstance(whole, str) else whole
-    mark = b"element" if kind == "ply" else b"\n"
-    word = {"off": b"\n# M\xf6bel\n", "stl": b" M\xf6bel\n", "ply": b"comment M\xf6bel\nelement"}[
-        kind
-    ]
     path.write_bytes(content.replace(mark, word, 1))
     assert len(load_arrays(At(path.name, "here"), path)[1]) == 12
 

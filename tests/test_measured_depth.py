@@ -25,7 +25,7 @@ from mover.stages.objects.place_inputs import coarser_image
 from mover.stages.objects.place_objects import energy_of
 
 
-def true_inputs(metric: bool = True) -> DepthImageInputs:
+def true_inputs() -> DepthImageInputs:
     """The boxes of the analytic room on its floor, and a network that sees them truly."""
     known = make_inputs(size=64)
     camera, objects = known.camera, known.objects
@@ -40,7 +40,7 @@ def true_inputs(metric: bool = True) -> DepthImageInputs:
     drawn = torch.where(seen.covered, seen.nearest, torch.inf)
     depth = torch.minimum(depth, drawn.amin(0))
     depth = torch.where(depth < 50, depth, torch.nan)
-    image = DepthImage(depth, metric)
+    image = DepthImage(depth, True)
     hidden = seen.covered.any(0)
     return DepthImageInputs(image, known.image, objects, camera, GROUND, layout, hidden)
 
@@ -56,23 +56,33 @@ def with_values(inputs: DepthImageInputs, values: torch.Tensor, metric: bool) ->
     return replace(inputs, depth=DepthImage(values, metric))
 
 
+@pytest.fixture(scope="module")
+def inputs():
+    return true_inputs()
+
+
+@pytest.fixture(scope="module")
+def values(small_room):
+    """Any depth of the room's picture."""
+    camera = small_room.capture.scene.camera
+    generator = torch.Generator().manual_seed(1)
+    return torch.rand(camera.height, camera.width, generator=generator) + 1
+
+
 @pytest.mark.parametrize("factor", [1.0, 1.15, 0.85])
-def test_the_factor_of_a_metric_network_is_found(factor):
-    inputs = true_inputs()
+def test_the_factor_of_a_metric_network_is_found(inputs, factor):
     scaled = with_values(inputs, factor * inputs.depth.values, True)
     assert float(errors(gather_depth(scaled), inputs).abs().median()) < 0.02
 
 
-def test_factor_and_shift_of_an_inverse_depth_are_found():
-    inputs = true_inputs()
+def test_factor_and_shift_of_an_inverse_depth_are_found(inputs):
     values = 300 / inputs.depth.values + 40
     found = gather_depth(with_values(inputs, values, False))
     assert float(errors(found, inputs).abs().median()) < 0.01
 
 
 @pytest.mark.parametrize("metric", [True, False])
-def test_an_object_that_stands_wrong_does_not_pull_the_others(metric):
-    inputs = true_inputs()
+def test_an_object_that_stands_wrong_does_not_pull_the_others(inputs, metric):
     far = inputs.layout.t_world_object.clone()
     far[1] *= 1.4
     values = inputs.depth.values if metric else 7 / inputs.depth.values + 1
@@ -81,8 +91,7 @@ def test_an_object_that_stands_wrong_does_not_pull_the_others(metric):
     assert float(errors(gather_depth(moved), inputs).abs().median()) < 0.03
 
 
-def test_nothing_is_said_where_nothing_gives_the_scale():
-    inputs = true_inputs()
+def test_nothing_is_said_where_nothing_gives_the_scale(inputs):
     empty = torch.full_like(inputs.depth.values, torch.nan)
     assert gather_depth(with_values(inputs, empty, True)) is None
     assert gather_depth(with_values(inputs, torch.full_like(empty, 5.0), False)) is None
@@ -98,33 +107,21 @@ def test_a_wrong_distance_costs_the_same_in_windows_of_fewer_pixels():
     assert torch.allclose(costs[0], costs[1], rtol=0.1)
 
 
-def test_a_capture_keeps_its_depth(tmp_path, small_room):
-    shape = small_room.capture.scene.camera.height, small_room.capture.scene.camera.width
-    for metric in (True, False):
-        values = torch.rand(shape, generator=torch.Generator().manual_seed(1)) + 1
-        values[:5] = torch.nan
-        capture = replace(small_room.capture, depth=DepthImage(values, metric))
-        write_capture(capture, tmp_path / str(metric))
-        found = read_capture(tmp_path / str(metric)).depth
-        assert found is not None
-        assert found.metric == metric
-        assert torch.equal(found.values.nan_to_num(0), values.nan_to_num(0))
-    with pytest.raises(ValueError, match="has depth, which the capture lacks"):
-        write_capture(small_room.capture, tmp_path / "True")
-
-
-def test_an_import_takes_measured_depth_along_and_the_newer_one_counts(tmp_path, small_room):
-    shape = small_room.capture.scene.camera.height, small_room.capture.scene.camera.width
-    values = torch.rand(shape, generator=torch.Generator().manual_seed(1)) + 1
-    for name, metric in (("metres", True), ("inverse", False)):
+def test_a_capture_keeps_its_depth_an_import_takes_it_along_and_the_newer_one_counts(
+    tmp_path, small_room, values
+):
+    values = torch.cat([torch.full_like(values[:5], torch.nan), values[5:]])
+    for name, metric in (("depth", True), ("disparity", False)):
         capture = replace(small_room.capture, depth=DepthImage(values, metric))
         write_capture(capture, tmp_path / name)
         made = import_into(tmp_path / "own", folder_parts(tmp_path / name))
-        found = read_capture(tmp_path / "own").depth
-        assert found is not None
-        assert found.metric == metric
-        assert torch.equal(found.values, values)
-        assert f"{'depth' if metric else 'disparity'}/" in made.written
+        assert f"{name}/" in made.written
+        for folder in (name, "own"):
+            found = read_capture(tmp_path / folder).depth
+            assert found.metric == metric
+            assert torch.equal(found.values.nan_to_num(0), values.nan_to_num(0))
+    with pytest.raises(ValueError, match="has depth, which the capture lacks"):
+        write_capture(small_room.capture, tmp_path / "depth")
     write_capture(small_room.capture, tmp_path / "none")
     made = import_into(tmp_path / "own", folder_parts(tmp_path / "none"))
     assert read_capture(tmp_path / "own").depth is not None
@@ -187,15 +184,18 @@ def test_a_pipe_as_depth_is_refused_at_once(kind, folder, tmp_path, small_room):
 def test_what_is_wrong_with_measured_depth_is_one_sentence(tmp_path, small_room):
     camera = small_room.capture.scene.camera
     assert find_depth_file(tmp_path) is None
-    (tmp_path / "depth").mkdir()
-    with pytest.raises(InputError, match=r"depth/: has no depth map, expected 000000\.npy or"):
-        find_depth_file(tmp_path)
-    (tmp_path / "disparity").mkdir()
-    with pytest.raises(InputError, match=r"has depth/ and disparity/, expected one of the two"):
-        find_depth_file(tmp_path)
+    for folder, words in (
+        ("depth", r"depth/: has no depth map, expected 000000\.npy or"),
+        ("disparity", r"has depth/ and disparity/, expected one of the two"),
+    ):
+        (tmp_path / folder).mkdir()
+        with pytest.raises(InputError, match=words):
+            find_depth_file(tmp_path)
     Image.new("RGB", (camera.width, camera.height)).save(tmp_path / "a.png")
-    with pytest.raises(InputError, match=r"a\.png: has RGB pixels, expected one grey value"):
-        read_depth_image(tmp_path / "a.png", camera, metric=False)
     np.save(tmp_path / "a.npy", np.ones((5, 5)))
-    with pytest.raises(InputError, match=r"a\.npy: has 5 x 5 values"):
-        read_depth_image(tmp_path / "a.npy", camera, metric=False)
+    for name, words in (
+        ("a.png", r"a\.png: has RGB pixels, expected one grey value"),
+        ("a.npy", r"a\.npy: has 5 x 5 values"),
+    ):
+        with pytest.raises(InputError, match=words):
+            read_depth_image(tmp_path / name, camera, metric=False)

@@ -13,8 +13,10 @@ import make_people as made
 import make_smpl
 import numpy as np
 import pytest
+import tiny_capture as tiny
 import torch
-from test_safe_pickle import BOMBS
+import trimesh
+from test_safe_pickle import BOMBS, Calls
 
 from mover.app import cli
 from mover.bodies import BODY_MODELS, load_model
@@ -106,23 +108,22 @@ def models(monkeypatch):
         monkeypatch.setitem(BODY_MODELS, name, lambda _, name=name: Toy(name))
 
 
-@pytest.fixture
-def faces(tmp_path):
+@pytest.fixture(scope="module")
+def faces(tmp_path_factory):
     """A mesh file with the triangles of the SMPL-X toy."""
-    path = tmp_path / "faces.ply"
-    import trimesh
-
+    path = tmp_path_factory.mktemp("faces") / "faces.ply"
     verts = made.person("smplx")["verts"][0]
     trimesh.Trimesh(verts, made.flesh("smplx")[2], process=False).export(path)
     return path
 
 
-def imported(tool: str, folder: Path, faces: Path, **known: Any):
-    source = folder / "source"
-    source.mkdir()
-    path = made.BODIES[tool](source)
-    more = {"faces": faces} if tool == "sam3dbody" else {}
-    found = bodies_from(tool.split(":")[0], path, replace(KNOWN, **more, **known))
+def known_of(tool: str, faces: Path, **more: Any) -> Known:
+    return replace(KNOWN, **({"faces": faces} if tool == "sam3dbody" else {}), **more)
+
+
+def imported(tool: str, folder: Path, faces: Path, **more: Any):
+    path = made.BODIES[tool](folder)
+    found = bodies_from(tool.split(":")[0], path, known_of(tool, faces, **more))
     if not tool.startswith("amass"):
         assert found.bodies.space == "camera"
         return found
@@ -179,33 +180,24 @@ def check_parameters(bodies, model):
     assert torch.allclose(joints, bodies.joints, atol=2e-3)
 
 
+FILES = {  # by suffix: how a file is read and written again
+    ".json": (lambda path: json.loads(path.read_text()), lambda value, path: path.write_text(
+        json.dumps(value, default=lambda x: np.asarray(x).astype(str).tolist()))),
+    ".npz": (lambda path: dict(np.load(path, allow_pickle=True)),
+             lambda value, path: np.savez(path, **value)),
+    ".npy": (lambda path: np.load(path, allow_pickle=True).item(),
+             lambda value, path: np.save(path, value, allow_pickle=True)),
+    ".pt": (lambda path: torch.load(path, weights_only=True), torch.save),
+    ".pkl": (joblib.load, lambda value, path: path.write_bytes(pickle.dumps(value))),
+}  # fmt: skip
+
+
 def load(path: Path) -> Any:
-    match path.suffix:
-        case ".json":
-            return json.loads(path.read_text())
-        case ".npz":
-            with np.load(path, allow_pickle=True) as arrays:
-                return dict(arrays)
-        case ".npy":
-            return np.load(path, allow_pickle=True).item()
-        case ".pt":
-            return torch.load(path, weights_only=True)
-        case _:
-            return joblib.load(path)
+    return FILES[path.suffix][0](path)
 
 
 def dump(value: Any, path: Path) -> None:
-    match path.suffix:
-        case ".json":
-            path.write_text(json.dumps(value, default=lambda x: np.asarray(x).astype(str).tolist()))
-        case ".npz":
-            np.savez(path, **value)
-        case ".npy":
-            np.save(path, value, allow_pickle=True)
-        case ".pt":
-            torch.save(value, path)
-        case _:
-            path.write_bytes(pickle.dumps(value))
+    FILES[path.suffix][1](value, path)
 
 
 def owners(tree: Any, start: tuple = ()) -> list[tuple[Any, tuple]]:
@@ -221,18 +213,16 @@ def owners(tree: Any, start: tuple = ()) -> list[tuple[Any, tuple]]:
 @pytest.mark.parametrize("tool", CASES)
 def test_a_field_that_is_missing_or_has_a_wrong_shape_is_named(tool, tmp_path, faces):
     name, source = CASES[tool].needed, made.BODIES[tool](tmp_path)
-    known, refused = replace(KNOWN, faces=faces if tool == "sam3dbody" else None), 0
-    for path in sorted(p for p in tmp_path.rglob("*") if p.is_file() and p != faces):
-        kept = path.read_bytes()
-        for value in (..., np.zeros(2), np.zeros((7, 1))):
+    known, refused = known_of(tool, faces), 0
+    files = sorted(p for p in tmp_path.rglob("*") if p.is_file())
+    for path in {files[0], files[-1]}:
+        kept, as_there = path.read_bytes(), torch.tensor if path.suffix == ".pt" else np.array
+        for value in (..., [0.0, 0.0], [[0.0]] * 7):
             tree = load(path)
-            held = [(node, way[-1]) for node, way in owners(tree) if way[-1] == name]
-            for node, key in held:
-                if value is ...:
-                    del node[key]
-                else:
-                    node[key] = torch.from_numpy(value) if path.suffix == ".pt" else value
-            if held:
+            ways = [way for _, way in owners(tree) if way[-1] == name]
+            for way in ways:
+                tiny.put(tree, way, value if value is ... else as_there(value))
+            if ways:
                 dump(tree, path)
                 words = f"no key .*'{name}'" if value is ... else name
                 with pytest.raises(InputError, match=words):
@@ -247,11 +237,10 @@ CHANGES = 10
 
 def changed(old: Any, rng: np.random.Generator) -> Any:
     options: list[Any] = [None, "abc", 0, -5, np.zeros(0), [1, 2], {"a": 1}, 1e300, b"x"]
-    numeric = isinstance(old, torch.Tensor) or (
-        isinstance(old, np.ndarray) and old.dtype.kind in "fiub"
-    )
-    array = np.asarray(old).astype(float) if numeric else None
-    if array is not None and array.size > 1:
+    kind = old.dtype.kind if isinstance(old, np.ndarray) else ""
+    numeric = isinstance(old, torch.Tensor) or kind in tuple("fiub")
+    array = np.asarray(old).astype(float) if numeric else np.zeros(1)
+    if array.size > 1:
         broken = array.copy()
         broken.flat[0] = np.inf
         options += [array[:-1], array.ravel(), array.T, array * 1e30, array * np.nan, broken]
@@ -263,12 +252,9 @@ def changed(old: Any, rng: np.random.Generator) -> Any:
 @pytest.mark.filterwarnings("ignore:invalid value encountered:RuntimeWarning")  # the toy's sums
 @pytest.mark.parametrize("tool", [*made.BODIES, *made.KEYPOINTS])
 def test_a_file_with_one_wrong_field_is_read_or_refused(tool, tmp_path, faces):
-    folder = tmp_path / "source"
-    folder.mkdir()
-    source = (made.BODIES | made.KEYPOINTS)[tool](folder)
-    known = replace(KNOWN, faces=faces if tool == "sam3dbody" else None)
+    source, known = (made.BODIES | made.KEYPOINTS)[tool](tmp_path), known_of(tool, faces)
     rng = np.random.default_rng(len(tool))
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    files = sorted(path for path in tmp_path.rglob("*") if path.is_file())
     for _ in range(CHANGES):
         path = files[rng.integers(len(files))]
         kept, tree = path.read_bytes(), load(path)
@@ -313,9 +299,7 @@ def test_tracks_of_slahmr_are_those_that_its_side_file_names(tmp_path):
     assert found.bodies.person.tolist() == [12] * 5
 
 
-def test_two_people_keep_their_tracks_though_each_image_lists_them_in_another_order(
-    tmp_path, faces
-):
+def test_two_people_keep_their_tracks_though_images_list_them_in_any_order(tmp_path, faces):
     bodies = imported("sam3dbody", tmp_path, faces).bodies
     assert len(bodies.frame) == 10
     depth = bodies.verts[..., 2].mean(1)
@@ -325,11 +309,8 @@ def test_two_people_keep_their_tracks_though_each_image_lists_them_in_another_or
 
 
 def test_the_lens_follows_from_joints_where_the_focal_length_is_missing(tmp_path, faces):
-    source = tmp_path / "source"
-    source.mkdir()
-    made.write_sam3dbody(source, focal=False)
-    found = bodies_from("sam3dbody", source, Known(faces=faces))
-    assert found.K is not None
+    made.write_sam3dbody(tmp_path, focal=False)
+    found = bodies_from("sam3dbody", tmp_path, Known(faces=faces))
     assert np.allclose(found.K, made.lens(1400), atol=0.5)
 
 
@@ -351,9 +332,7 @@ def test_a_moving_camera_is_named(tmp_path):
 
 def test_a_model_file_in_the_true_format_gives_meshes_and_keeps_flat_hands(tmp_path, monkeypatch):
     monkeypatch.undo()
-    (tmp_path / "smplx").mkdir()
-    make_smpl.write_npz(make_smpl.make_model("smplx"), tmp_path / "smplx" / "SMPLX_NEUTRAL.npz")
-    monkeypatch.setenv("MOVER_BODY_MODELS", str(tmp_path))
+    monkeypatch.setenv("MOVER_BODY_MODELS", str(make_smpl.write_models(tmp_path, ["smplx"])))
     true = made.person("smplx")
     angles = torch.from_numpy(true["angles"]).float()
     pose = BodyPose(
@@ -437,21 +416,17 @@ def test_what_is_wrong_is_refused_by_name(case, tmp_path):
         bodies_from(tool, write(tmp_path), known)
 
 
-def test_one_frame_is_enough(tmp_path):
-    assert bodies_from("smplifyx", smplify_file(tmp_path)).bodies.frame.tolist() == [0]
-
-
-def test_codes_of_vposer_are_decoded_with_its_weights(tmp_path):
+def test_one_frame_is_enough_and_codes_of_vposer_are_decoded_with_its_weights(tmp_path):
     """The fixture's decoder: the angles are a linear map of the code."""
-    code = np.linspace(-1, 1, 32)[None]
+    assert bodies_from("smplifyx", smplify_file(tmp_path)).bodies.frame.tolist() == [0]
+    code = torch.linspace(-1, 1, 32)[None]
 
     def decode(given):
         return torch.cat([given, given[:, :31]], 1) * 0.1
 
-    path = smplify_file(tmp_path, body_pose=code)
+    path = smplify_file(tmp_path, body_pose=code.numpy())
     found = bodies_from("smplifyx", path, replace(KNOWN, decode=decode))
-    wanted = decode(torch.from_numpy(code).float())
-    torch.testing.assert_close(found.bodies.pose.body_pose, wanted)
+    torch.testing.assert_close(found.bodies.pose.body_pose, decode(code))
 
 
 def test_frames_with_nan_are_left_out_and_named(tmp_path):
@@ -463,31 +438,22 @@ def test_frames_with_nan_are_left_out_and_named(tmp_path):
     assert any("NaN in frame 1" in warning for warning in found.warnings)
 
 
-class Hostile:
-    def __reduce__(self):
-        return (os.system, ("touch owned",))
-
-
-HOSTILE = {**BOMBS, "a call": Hostile}
-
-
-@pytest.mark.parametrize("bomb", HOSTILE)
 @pytest.mark.parametrize("tool", made.BODIES)
-def test_hostile_pickles_of_every_tool_are_refused_at_once_and_not_run(
-    tool, bomb, tmp_path, monkeypatch
-):
+def test_hostile_pickles_of_every_tool_are_refused_at_once_and_not_run(tool, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     path = made.BODIES[tool](tmp_path)
-    files = [f for f in tmp_path.rglob("*") if f.suffix in (".pkl", ".npy", ".pt")]
-    words = "" if bomb == "a call" else ": (unfolds|holds a list)"
-    for file in files:
+    hostile = [(bomb(), ": (unfolds|holds a list)") for bomb in BOMBS.values()]
+    hostile.append((Calls(os.system, "touch owned"), ""))
+    for file in [f for f in tmp_path.rglob("*") if f.is_file()]:
+        assert file.suffix in FILES
+        if file.suffix in (".npz", ".json"):
+            continue  # these hold no pickles
         kept = file.read_bytes()
-        dump({"pose": HOSTILE[bomb]()}, file)
-        with pytest.raises(InputError, match=file.name + words):
-            bodies_from(tool.split(":")[0], path, KNOWN)
+        for value, words in hostile:
+            dump({"pose": value}, file)
+            with pytest.raises(InputError, match=file.name + words):
+                bodies_from(tool.split(":")[0], path, KNOWN)
         file.write_bytes(kept)
-    others = {f.suffix for f in tmp_path.rglob("*") if f.is_file()} - {".pkl", ".npy", ".pt"}
-    assert others <= {".npz", ".json"}  # these hold no pickles
     assert not (tmp_path / "owned").exists()
 
 
@@ -585,9 +551,9 @@ def test_unlikely_people_are_named_with_a_cure(case, tmp_path):
     (warning,) = odd_bodies(found)
     assert re.search(words, warning)
     write_bodies(found, tmp_path / "bodies.npz")
-    words: list[str] = []
-    read_bodies(tmp_path / "bodies.npz", words.append)
-    assert words == [f"bodies.npz: {warning}"]
+    said: list[str] = []
+    read_bodies(tmp_path / "bodies.npz", said.append)
+    assert said == [f"bodies.npz: {warning}"]
 
 
 def test_pieces_of_whams_walker_are_one_person_and_the_user_can_join_more(tmp_path):
@@ -617,12 +583,13 @@ def test_a_missing_model_is_named_with_the_position_of_its_file(tmp_path, monkey
 
 
 @pytest.mark.parametrize("tool", made.KEYPOINTS)
-def test_keypoints_fall_on_the_joints_they_name(tool, tmp_path):
+def test_keypoints_fall_on_the_joints_they_name_and_are_read_again(tool, tmp_path):
     found = keypoints_from(tool.split(":")[0], made.KEYPOINTS[tool](tmp_path), Known(fps=30.0))
     assert found.frame.tolist() == made.FRAMES.tolist()
     assert len(found.person.unique()) == 1
     joints = LAYOUTS[found.layout]
     assert found.points.shape == (5, len(joints), 2)
+    assert found.layout == ("openpose137" if tool == "openpose" else found.layout)
     true, checked = made.person("smplx")["pixels"], 0
     for k, name in enumerate(joints):
         joint = made.SHOWN.get("mid_hip" if name == "pelvis" else name)
@@ -637,15 +604,11 @@ def test_keypoints_fall_on_the_joints_they_name(tool, tmp_path):
     if tool == "openpose":
         for wrist, body in ((25, 7), (46, 4)):  # the first joint of a hand is its wrist
             assert torch.allclose(found.points[:, wrist], found.points[:, body])
-
-
-def test_keypoints_that_are_written_are_read_again(tmp_path):
-    found = keypoints_from("openpose", made.write_openpose(tmp_path), Known(fps=5.0))
     write_keypoints(found, tmp_path / "keypoints.npz")
     again = read_keypoints(tmp_path / "keypoints.npz")
     assert torch.equal(again.points, found.points)
     assert torch.equal(again.confidence, found.confidence)
-    assert (again.layout, again.fps) == ("openpose137", 5.0)
+    assert (again.layout, again.fps) == (found.layout, 30.0)
 
 
 def openpose(folder: Path, frame: int, *people: np.ndarray) -> None:
@@ -675,19 +638,16 @@ def test_people_without_joints_are_left_out_and_no_person_is_refused(tmp_path):
         keypoints_from("openpose", tmp_path)
 
 
-def test_joints_with_nan_are_missing(tmp_path):
+def test_joints_with_nan_are_missing_and_another_number_of_them_is_refused(tmp_path):
     path = made.write_coco17(tmp_path)
-    rows = json.loads(path.read_text())
+    rows = load(path)
     rows[0]["keypoints"][15] = float("nan")
-    path.write_text(json.dumps(rows))
+    dump(rows, path)
     found = keypoints_from("coco17", path)
     assert found.confidence[0, 5] == 0
     assert found.points.isfinite().all()
-
-
-def test_another_number_of_joints_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"keypoints.*expected 26 joints"):
-        keypoints_from("halpe26", made.write_coco17(tmp_path))
+        keypoints_from("halpe26", path)
     openpose(tmp_path, 0, np.ones((18, 3)))
     with pytest.raises(InputError, match="expected 25 triples"):
         keypoints_from("openpose", tmp_path / "v_000000000000_keypoints.json")
@@ -749,7 +709,6 @@ def test_real_people_of_sam_3d_body_fall_on_their_own_keypoints_and_stand_up(tmp
     bodies = found.bodies
     assert bodies.verts.shape == (4, 18439, 3)
     assert sorted(bodies.person.tolist()) == [0, 1, 2, 3]
-    assert found.K is not None
     for file in sorted(SHARED.glob("img_*.npz")):
         given = types.SimpleNamespace(**np.load(file))
         seen_at = project(torch.from_numpy(given.pred_keypoints_3d + given.pred_cam_t), found.K)

@@ -33,6 +33,9 @@ def test_a_mesh_without_a_file_becomes_glb_with_the_same_triangles(tmp_path):
     assert found.objects[0].annotation is None
     assert torch.allclose(place_object(found.objects[0]).verts, place_object(piece()).verts)
     assert found.objects[0].mesh.faces.tolist() == tiny.STEP_FACES.tolist()
+    tree = json.loads((tmp_path / "scene.json").read_text())
+    assert tree["objects"][0]["translation"] == [0.1, -1.0, -2.0]  # short decimals
+    assert tree["objects"][0]["yaw"] == 0.3
 
 
 def test_how_far_off_all_sizes_are_together_is_kept_and_by_itself_nothing(tmp_path):
@@ -62,9 +65,8 @@ def test_materials_and_textures_go_with_an_obj_and_two_do_not_mix(tmp_path):
         home = tmp_path / colour
         (home / "maps").mkdir(parents=True)
         tiny.write_obj(home / "thing.obj", tiny.STEP, tiny.STEP_FACES)
-        (home / "thing.obj").write_text(
-            "mtllib my stuff.mtl\nmtllib ../secret.mtl\n" + (home / "thing.obj").read_text()
-        )
+        text = "mtllib my stuff.mtl\nmtllib ../secret.mtl\n" + (home / "thing.obj").read_text()
+        (home / "thing.obj").write_text(text)
         (home / "my stuff.mtl").write_text(f"newmtl {colour}\nmap_Kd -s 1 1 1 maps/wood.png\n")
         (home / "maps" / "wood.png").write_text(colour)
         pieces.append(piece(colour, str(home / "thing.obj")))
@@ -74,9 +76,8 @@ def test_materials_and_textures_go_with_an_obj_and_two_do_not_mix(tmp_path):
     assert not [p for p in files if "secret" in p.name]
     for colour in ("red", "blue"):
         home = tmp_path / "out" / "meshes" / colour
-        assert (home / f"{colour}.obj").read_bytes() == (
-            tmp_path / colour / "thing.obj"
-        ).read_bytes()
+        given = (tmp_path / colour / "thing.obj").read_bytes()
+        assert (home / f"{colour}.obj").read_bytes() == given
         assert colour in (home / "my stuff.mtl").read_text()
         assert (home / "maps" / "wood.png").read_text() == colour
     assert len(read_scene(tmp_path / "out" / "scene.json").objects) == 2
@@ -89,9 +90,8 @@ def test_the_buffer_of_a_gltf_goes_with_it(tmp_path):
     files: Any = trimesh.Scene(body).export(file_type="gltf")
     for name, content in files.items():
         (tmp_path / name).write_bytes(content)
-    write_scene(
-        Scene(CAMERA, None, (piece("a", str(tmp_path / "model.gltf")),)), tmp_path / "o" / "s.json"
-    )
+    scene = Scene(CAMERA, None, (piece("a", str(tmp_path / "model.gltf")),))
+    write_scene(scene, tmp_path / "o" / "s.json")
     found = read_scene(tmp_path / "o" / "s.json").objects[0]
     assert torch.equal(found.mesh.verts, step().verts)
 
@@ -118,17 +118,8 @@ def test_vertices_that_no_face_uses_and_faces_without_area_do_not_count(tmp_path
 
 def test_a_scene_without_any_camera_is_refused(tmp_path):
     folder = tiny.write_capture(tmp_path / "tiny")
-    with pytest.raises(
-        InputError, match=r"scene.json: field 'camera' has nothing, expected a camera"
-    ):
+    with pytest.raises(InputError, match=r"scene.json: field 'camera' has nothing, expected a cam"):
         read_scene(folder / "scene.json")
-
-
-def test_numbers_are_written_as_short_decimals_that_read_back_the_same(tmp_path):
-    write_scene(Scene(CAMERA, None, (piece(),)), tmp_path / "scene.json")
-    tree = json.loads((tmp_path / "scene.json").read_text())
-    assert tree["objects"][0]["translation"] == [0.1, -1.0, -2.0]
-    assert tree["objects"][0]["yaw"] == 0.3
 
 
 def test_a_mesh_whose_remarks_are_latin_1_is_read(tmp_path):

@@ -29,19 +29,21 @@ HUMAN = torch.tensor([0.5, 1.7, 0.3])
 CORNERS = torch.cartesian_prod(*[torch.tensor([-0.5, 0.5])] * 3) * HUMAN
 FACES = torch.tensor([[0, 1, 2]])
 FRAMES = range(12)
+Rows = list[tuple[int, int, tuple[float, float, float]]]
+"""Frames, tracks and positions."""
 
 
-def bodies_of_rows(rows: list[tuple[int, int, tuple[float, float, float]]]) -> Bodies:
+def bodies_of_rows(rows: Rows) -> Bodies:
     """Boxes of a person's size, each a frame, a track and a position."""
     verts = torch.stack([CORNERS + torch.tensor(place) for _, _, place in rows])
     frame, person = (torch.tensor([row[k] for row in rows]) for k in (0, 1))
     return Bodies(verts, FACES, None, (), frame, person, 30.0, "camera", None)
 
 
-def masks_of(rows: list[tuple[int, int, tuple[float, float, float]]], shown: float = 1.0) -> People:
+def masks_of(rows: Rows, shown: float = 1.0) -> People:
     """Their boxes in the image, of which the upper part is shown."""
     codes: list[bytes] = []
-    for place in (row[2] for row in rows):
+    for _, _, place in rows:
         pixels = project(CORNERS + torch.tensor(place), CAMERA.K).round().long()
         (left, top), (right, low) = pixels.amin(0).clamp_min(0), pixels.amax(0)
         mask = torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.bool)
@@ -51,7 +53,7 @@ def masks_of(rows: list[tuple[int, int, tuple[float, float, float]]], shown: flo
     return People(Masks(CAMERA.height, CAMERA.width, tuple(codes)), frame, person, {"1": 1.8})
 
 
-def walkers(first: int, second: int) -> list[tuple[int, int, tuple[float, float, float]]]:
+def walkers(first: int, second: int) -> Rows:
     """One walks from the left to the middle, the other stands at the right."""
     rows = [(f, first, (-1 + 0.05 * f, 0.0, 3.5)) for f in FRAMES]
     return rows + [(f, second, (1.0, 0.1, 4.0)) for f in FRAMES]
@@ -80,12 +82,18 @@ def test_tracks_of_two_tools_are_paired_by_position(case, shown):
 
 
 def test_pieces_are_one_person_where_the_other_side_is_whole():
-    rows = walkers(0, 1)
-    cut = [(f, 9 if p == 0 and f > 5 else p, place) for f, p, place in rows]
-    pairs = pair_tracks(bodies_of_rows(cut), masks_of(rows), CAMERA)
+    rows, cut = walkers(0, 1), in_pieces()
+    bodies, people = bodies_of_rows(cut), replace(masks_of(rows), heights={"9": 1.7, "1": 1.8})
+    pairs = pair_tracks(bodies, people, CAMERA)
     assert (pairs.bodies, pairs.masks) == ({9: 0}, {})
+    assert paired(bodies, people, pairs)[1].heights == {"0": 1.7, "1": 1.8}
     pairs = pair_tracks(bodies_of_rows(rows), masks_of(cut), CAMERA)
     assert (pairs.bodies, pairs.masks) == ({}, {9: 0})
+
+
+def in_pieces() -> Rows:
+    """The first walker has another number after frame 5."""
+    return [(f, 9 if p == 0 and f > 5 else p, place) for f, p, place in walkers(0, 1)]
 
 
 HEIGHTS = {  # bodies' and masks' numbers of two people; heights by the old and the new ones
@@ -102,25 +110,15 @@ def test_heights_in_a_written_capture_follow_the_new_numbers(case, tmp_path):
     rows = [row for row in walkers(*ours, *[99][: 2 - len(ours)]) if row[1] != 99]
     people = replace(masks_of(walkers(*theirs)), heights=given)
     scene = replace(little_room.room(), camera=CAMERA, objects=())
-    write_capture(Capture(
-        "room", scene, None, (), None, None, bodies_of_rows(rows), people, None, (),
-    ), tmp_path)  # fmt: skip
+    bodies = bodies_of_rows(rows)
+    write_capture(Capture("room", scene, None, (), None, None, bodies, people, None, ()), tmp_path)
     capture = read_capture(tmp_path)
     assert capture.people.heights == wanted
-    import_into(tmp_path, Parts("", bodies=At(bodies_to_arrays(bodies_of_rows(rows)), "b.npz")))
+    import_into(tmp_path, Parts("", bodies=At(bodies_to_arrays(bodies), "b.npz")))
     info = json.loads((tmp_path / "people.json").read_text())["info"]
     assert info["heights"] == wanted
     unknown = [text for text in read_capture(tmp_path).warnings if "unknown track 9" in text]
     assert bool(unknown) == ("9" in given)
-
-
-def test_heights_of_bodies_without_masks_follow_their_pieces():
-    rows = walkers(0, 1)
-    cut = [(f, 9 if p == 0 and f > 5 else p, place) for f, p, place in rows]
-    people = replace(masks_of(rows), heights={"9": 1.7, "1": 1.8})
-    bodies = bodies_of_rows(cut)
-    _, masks = paired(bodies, people, pair_tracks(bodies, people, CAMERA))
-    assert masks.heights == {"0": 1.7, "1": 1.8}
 
 
 def test_what_is_uncertain_keeps_its_number():
@@ -128,10 +126,10 @@ def test_what_is_uncertain_keeps_its_number():
     near = [(f, p, (0.05 * p, 0.0, 3.5)) for f in FRAMES for p in (0, 1)]
     others = [(f, p + 5, place) for f, p, place in near]
     assert pair_tracks(bodies_of_rows(near), masks_of(others), CAMERA).notes == ()
-    elsewhere = [(f, 0, (-1.2, 0.0, 5.0)) for f in FRAMES] + [
-        (f, 4, (1.0, 0.0, 4.0)) for f in FRAMES
-    ]
     alone = [(f, 0, (1.0, 0.0, 4.0)) for f in FRAMES]
+    elsewhere = [(f, 0, (-1.2, 0.0, 5.0)) for f in FRAMES] + [
+        (f, 4, place) for f, _, place in alone
+    ]
     pairs = pair_tracks(bodies_of_rows(alone), masks_of(elsewhere), CAMERA)
     assert (pairs.bodies, pairs.masks) == ({}, {4: 0, 0: 5})
     apart = replace(bodies_of_rows(alone), frame=torch.arange(100, 100 + len(FRAMES)))
@@ -142,9 +140,7 @@ def test_what_is_uncertain_keeps_its_number():
 # Pieces of one track.
 
 
-def walk(
-    spans: dict[int, range], step: float = 0.02
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def walk(spans: dict[int, range], step: float = 0.02) -> tuple[torch.Tensor, ...]:
     """One who walks to the right, as the tracks of these frames."""
     rows = [(f, track) for track, span in spans.items() for f in span]
     place = torch.tensor([[-1 + step * f, 0.1, 5.0 - step * f] for f, _ in rows])

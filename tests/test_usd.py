@@ -1,7 +1,7 @@
 """Physics and people in USD, read back with usd-core's own schemas and validators."""
 
-import dataclasses
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +26,8 @@ def room() -> Scene:
     """A stretched chair, a table that hangs, and a floor lamp."""
     scene = furnished(("chair", "table", "floor lamp"))
     chair, table, lamp = scene.objects
-    pieces = (
-        dataclasses.replace(chair, scale=torch.tensor([1.2, 0.9, 1.1])),
-        dataclasses.replace(table, support="free"),
-        lamp,
-    )
-    return dataclasses.replace(scene, objects=pieces)
+    chair = replace(chair, scale=torch.tensor([1.2, 0.9, 1.1]))
+    return replace(scene, objects=(chair, replace(table, support="free"), lamp))
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +38,12 @@ def kept(tmp_path_factory):
         patch.setattr(mover.io.export.solids, "find_spec", lambda _: None)
         solids_of(room(), Run(folder))
     return folder
+
+
+def in_file(points: np.ndarray, up: str) -> np.ndarray:
+    """Points of the world in the file's axes."""
+    x, y, z = points.T
+    return points if up == "y" else np.stack([x, -z, y - GROUND], -1)
 
 
 @pytest.fixture
@@ -125,9 +127,7 @@ def test_pieces_and_looks_fill_the_same_place_and_the_floor_is_below(out, up):
     stage, home = stage_of(out, up=up)
     cache = UsdGeom.BBoxCache(0, [UsdGeom.Tokens.default_, UsdGeom.Tokens.guide])
     for piece in home.scene.objects:
-        truth = place_object(piece).verts.double().numpy()
-        if up == "z":
-            truth = np.stack([truth[:, 0], -truth[:, 2], truth[:, 1] - GROUND], -1)
+        truth = in_file(place_object(piece).verts.double().numpy(), up)
         node = stage.GetPrimAtPath(f"/room/{piece.id}")
         assert node.GetCustomDataByKey("mover:category") == piece.category
         for part, off in (("visual", 1e-5), ("collision", 2e-3)):
@@ -184,9 +184,7 @@ def test_people_are_where_they_were_in_every_frame(out, up):
             frame = float(bodies.frame[row])
             points = np.array(mesh.GetPointsAttr().Get(frame), float)
             found = (np.c_[points, np.ones(len(points))] @ matrix)[:, :3]
-            truth = bodies.verts[row].double().numpy()
-            if up == "z":
-                truth = np.stack([truth[:, 0], -truth[:, 2], truth[:, 1] - GROUND], -1)
+            truth = in_file(bodies.verts[row].double().numpy(), up)
             assert np.linalg.norm(found - truth, axis=1).max() < 0.0025
             assert mesh.ComputeVisibility(frame) == "inherited"
     assert mesh.ComputeVisibility(float(bodies.frame.min())) == "invisible"
@@ -211,8 +209,8 @@ def test_the_camera_sees_the_same_pixels(out):
 def test_ids_that_the_file_keeps_for_itself_stay_apart(out):
     scene = room()
     names = ("ground", "physics", "wood")
-    pieces = [dataclasses.replace(p, id=n) for p, n in zip(scene.objects, names, strict=True)]
-    home = Finished(out, dataclasses.replace(scene, objects=tuple(pieces)), None, None)
+    pieces = [replace(p, id=n) for p, n in zip(scene.objects, names, strict=True)]
+    home = Finished(out, replace(scene, objects=tuple(pieces)), None, None)
     stage = Usd.Stage.Open(str(export_usd(home, out).files[0]))
     ids = [p.GetCustomDataByKey("mover:id") for p in stage.Traverse()]
     assert set(names) <= set(ids)
@@ -223,8 +221,8 @@ def test_an_object_that_is_moved_stands_still_until_it_stands_elsewhere(out):
     chair, *others = scene.objects
     later = Segment(12, chair.t_world_object + torch.tensor([0.0, 0.0, 1.0]), chair.yaw + 1)
     segments = (Segment(0, chair.t_world_object, chair.yaw), later)
-    moved = dataclasses.replace(chair, segments=segments)
-    home = Finished(out, dataclasses.replace(scene, objects=(moved, *others)), None, None)
+    moved = replace(chair, segments=segments)
+    home = Finished(out, replace(scene, objects=(moved, *others)), None, None)
     stage = Usd.Stage.Open(str(export_usd(home, out).files[0]))
     prim = next(p for p in stage.Traverse() if p.GetCustomDataByKey("mover:id") == chair.id)
     move = prim.GetAttribute("xformOp:translate")

@@ -1,7 +1,7 @@
 """A tiny capture folder, made with plain json and numpy: an oracle for the readers and writers."""
 
 import json
-from itertools import groupby
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,10 +48,10 @@ def person_mask(row: int) -> np.ndarray:
 
 
 def runs(mask: np.ndarray) -> list[int]:
-    """Run lengths down the columns, background first, by counting."""
-    flat = mask.T.ravel().tolist()
-    counts = [len(list(group)) for _, group in groupby(flat)]
-    return ([0] if flat[0] else []) + counts
+    """Run lengths down the columns, background first."""
+    flat = mask.T.ravel()
+    ends = [0, *(np.flatnonzero(flat[1:] != flat[:-1]) + 1), flat.size]
+    return [0] * int(flat[0]) + np.diff(ends).tolist()
 
 
 def compressed(counts: list[int]) -> str:
@@ -154,7 +154,19 @@ def picture() -> np.ndarray:
     return pixels
 
 
+def put(tree: Any, way: Sequence[Any], value: Any) -> None:
+    """Set the field of nested lists and objects to which the way leads; `...` deletes it."""
+    *way, last = way
+    for key in way:
+        tree = tree[key]
+    if value is ...:
+        del tree[last]
+    else:
+        tree[last] = value
+
+
 def write_obj(path: Path, verts: np.ndarray, faces: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
     lines = ["v " + " ".join(map(str, v)) for v in verts.tolist()]
     lines += ["f " + " ".join(str(i + 1) for i in f) for f in faces.tolist()]
     path.write_text("\n".join(lines) + "\n")
@@ -166,11 +178,9 @@ def write_glb(path: Path) -> None:
 
     transform = np.diag([0.5, 0.5, 0.5, 1.0])
     transform[:3, 3] = [0.1, 0.2, 0.3]
-    body = trimesh.Trimesh(STEP, STEP_FACES, process=False)
     whole = trimesh.Scene()
-    whole.add_geometry(body, transform=transform)
-    content: Any = whole.export(file_type="glb")
-    path.write_bytes(content)
+    whole.add_geometry(trimesh.Trimesh(STEP, STEP_FACES, process=False), transform=transform)
+    whole.export(path, file_type="glb")
 
 
 def write_capture(folder: Path) -> Path:
