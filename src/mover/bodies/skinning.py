@@ -317,17 +317,13 @@ def open_body(detail: Literal["small", "full"] = "small") -> SkinnedBody:
         index = torch.from_numpy(data["weight_joint"].astype(np.int64))
         weights = torch.zeros(len(index), count).scatter_add(1, index, array["weight"])
         return SkinnedBody(
-            name="makehuman",
-            faces=torch.from_numpy(data["faces"].astype(np.int64)),
+            name="makehuman", faces=torch.from_numpy(data["faces"].astype(np.int64)),
             joint_names=tuple(str(n) for n in data["joint_names"]),
             parents=tuple(int(p) for p in data["parents"]),
-            weights=weights / weights.sum(1, keepdim=True),
-            verts=array["verts"],
-            joints=array["joints"],
-            shape_dirs=array["shape_dirs"],
-            joint_dirs=array["joint_dirs"],
+            weights=weights / weights.sum(1, keepdim=True), verts=array["verts"],
+            joints=array["joints"], shape_dirs=array["shape_dirs"], joint_dirs=array["joint_dirs"],
             tpose=array["tpose"],
-        )
+        )  # fmt: skip
 
 
 def zero_pose(bodies: int, model: SkinnedBody) -> BodyPose:

@@ -66,23 +66,16 @@ def body_from(arrays: Mapping[str, Any], name: str, gender: str, file: str) -> S
     faces = _indices(arrays, "f", (None, 3), verts, file)
     at_joints = (regressor @ dirs.reshape(verts, -1)).reshape(joints, 3, -1)
     return SkinnedBody(
-        name=name,
-        faces=torch.from_numpy(faces),
-        joint_names=kind.joints,
-        parents=_parents(arrays, name, file),
-        verts=_tensor(template),
-        joints=_tensor(regressor @ template),
-        weights=_tensor(weights),
-        shape_dirs=_tensor(dirs[..., shape]),
-        joint_dirs=_tensor(at_joints[..., shape]),
+        name=name, faces=torch.from_numpy(faces), joint_names=kind.joints,
+        parents=_parents(arrays, name, file), verts=_tensor(template),
+        joints=_tensor(regressor @ template), weights=_tensor(weights),
+        shape_dirs=_tensor(dirs[..., shape]), joint_dirs=_tensor(at_joints[..., shape]),
         tpose=torch.eye(3).expand(joints, 3, 3).clone(),
-        pose_dirs=_tensor(poses.transpose(2, 0, 1)),
-        expression_dirs=_tensor(dirs[..., expression]),
+        pose_dirs=_tensor(poses.transpose(2, 0, 1)), expression_dirs=_tensor(dirs[..., expression]),
         expression_joint_dirs=_tensor(at_joints[..., expression]),
-        hands=_hands(arrays, file) if kind.hands else None,
-        face=_face(arrays, faces, file),
+        hands=_hands(arrays, file) if kind.hands else None, face=_face(arrays, faces, file),
         gender=gender,
-    )
+    )  # fmt: skip
 
 
 def _tensor(value: Array) -> torch.Tensor:

@@ -280,30 +280,20 @@ def pose_of(at: Unknowns, frame: Frame, model: SkinnedBody) -> BodyPose:
         )
         extra[FLAT] = body.new_ones(len(body), 1)
     return BodyPose(
-        model=model.name,
-        gender=model.gender,
-        betas=betas,
-        global_orient=rotation_vectors(turns_of(at, frame)[:, 0]),
-        body_pose=body,
-        transl=pelvis_of(at, frame) - rest,
-        extra=extra,
-    )
+        model=model.name, gender=model.gender, betas=betas,
+        global_orient=rotation_vectors(turns_of(at, frame)[:, 0]), body_pose=body,
+        transl=pelvis_of(at, frame) - rest, extra=extra,
+    )  # fmt: skip
 
 
 def bodies_of(pose: BodyPose, model: BodyModel, keypoints: Keypoints) -> Bodies:
     """Meshes and joints, in the camera frame."""
     verts, joints = run_model(model, pose)
     return Bodies(
-        verts=verts,
-        faces=model.faces,
-        joints=joints,
-        joint_names=model.joint_names,
-        frame=keypoints.frame,
-        person=keypoints.person,
-        fps=keypoints.fps,
-        space="camera",
+        verts=verts, faces=model.faces, joints=joints, joint_names=model.joint_names,
+        frame=keypoints.frame, person=keypoints.person, fps=keypoints.fps, space="camera",
         pose=pose,
-    )
+    )  # fmt: skip
 
 
 def miss_of(state: FitState) -> Float[Tensor, " bodies"]:

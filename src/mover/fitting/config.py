@@ -90,22 +90,10 @@ class FitConfig:
 Preset = Literal["robust", "paper"]
 
 PAPER = FitConfig(
-    loose=0.0,
-    left=0.0,
-    limits=0.0,
-    smooth_joints=1e2,
-    smooth_pixels=1e-2,
-    still=0.0,
-    held=0.0,
-    stands=0.0,
-    lies=0.0,
-    acceleration=0.0,
-    jitter=1.0,
-    by_size=False,
-    independent_frames=1_000_000,
-    lasting=False,
-    stages=tuple(replace(stage, smooth=1.0, steps=300) for stage in PUBLISHED[3:]),
-)
+    loose=0.0, left=0.0, limits=0.0, smooth_joints=1e2, smooth_pixels=1e-2, still=0.0, held=0.0,
+    stands=0.0, lies=0.0, acceleration=0.0, jitter=1.0, by_size=False, independent_frames=1_000_000,
+    lasting=False, stages=tuple(replace(stage, smooth=1.0, steps=300) for stage in PUBLISHED[3:]),
+)  # fmt: skip
 """SMPLify-X and L_smooth (Sec. 3.2), in the two stages that the authors' fit of videos runs.
 
 With no acceleration and a jitter of 1 m a second difference is divided by 1: it is weighted as

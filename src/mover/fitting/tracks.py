@@ -202,16 +202,11 @@ def seen_of(keypoints: Keypoints, rig: Rig, camera: Camera, config: FitConfig) -
     weight = confidence_of(keypoints, config)[:, rig.keypoints]
     pixels = keypoints.points[:, rig.keypoints]
     return Seen(
-        pixels=torch.where(weight[..., None] > 0, pixels, torch.zeros_like(pixels)),
-        weight=weight,
-        K=camera.K.to(pixels),
-        height=camera.height,
-        up=camera.R_cam_world[:, 1].to(pixels),
-        floor=None,
-        motion=motion_of(keypoints, None, config),
-        centre=resting(len(weight), pixels),
+        pixels=torch.where(weight[..., None] > 0, pixels, torch.zeros_like(pixels)), weight=weight,
+        K=camera.K.to(pixels), height=camera.height, up=camera.R_cam_world[:, 1].to(pixels),
+        floor=None, motion=motion_of(keypoints, None, config), centre=resting(len(weight), pixels),
         spread=spreads(len(weight), pixels),
-    )
+    )  # fmt: skip
 
 
 def factors_of(stage: Stage) -> dict[str, float]:

@@ -335,17 +335,11 @@ def _screen_inputs(
         points.append(outermost(verts - origin).float())
     things = torch.tensor([thing for thing, _ in pairs])
     return ScreenInputs(
-        camera=picture.camera,
-        boxes=cues.boxes,
-        sides=cues.sides,
-        depth=median_depths(picture.depth, picture.masks),
-        thing=things,
-        points=torch.stack(points),
-        height=height,
-        tilt_spread=picture.tilt_spread,
-        prior=picture.prior,
+        camera=picture.camera, boxes=cues.boxes, sides=cues.sides,
+        depth=median_depths(picture.depth, picture.masks), thing=things, points=torch.stack(points),
+        height=height, tilt_spread=picture.tilt_spread, prior=picture.prior,
         given=rows_of(axes_of(picture), things, "objects"),
-    )
+    )  # fmt: skip
 
 
 def axes_of(picture: Picture) -> Given:

@@ -90,14 +90,10 @@ _PLANE = AlignConfig(sigmas=(0.1,), offset_prior=0.0, votes="points")
 _NAMED_FEET = FootContactConfig(given=True)
 
 PAPER = Config(
-    select=SelectConfig("each"),
-    foot_contacts=_NAMED_FEET,
-    align=_PLANE,
-    layout=PlaceConfig(weights=IMAGE_ONLY, method=Adam(1000)),
-    gather=GatherConfig(erode=2),
-    assign=AssignConfig("mask_hits"),
-    place=PlaceConfig(),
-)
+    select=SelectConfig("each"), foot_contacts=_NAMED_FEET, align=_PLANE,
+    layout=PlaceConfig(weights=IMAGE_ONLY, method=Adam(1000)), gather=GatherConfig(erode=2),
+    assign=AssignConfig("mask_hits"), place=PlaceConfig(),
+)  # fmt: skip
 
 Settings = Mapping[str, Any]
 """Values by the dotted names of their settings."""

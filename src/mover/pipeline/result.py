@@ -73,19 +73,15 @@ def furnished(
                 humans.contacts.seated_on, people.path,
             ))  # fmt: skip
     return Room(
-        scene=Scene(camera, placed.ground, objects),
-        initial=capture.scene,
-        image_only=Scene(camera, placed.ground, by_image),
-        bodies=bodies,
-        kept=None if people is None else people.kept,
-        proxies=proxy_meshes(prepared),
+        scene=Scene(camera, placed.ground, objects), initial=capture.scene,
+        image_only=Scene(camera, placed.ground, by_image), bodies=bodies,
+        kept=None if people is None else people.kept, proxies=proxy_meshes(prepared),
         evidence=_evidence(setup, placed, humans),
-        covariance=None if people is None else people.alignment.covariance,
-        traces=placed.traces,
+        covariance=None if people is None else people.alignment.covariance, traces=placed.traces,
         warnings=tuple(dict.fromkeys(warnings)),
         path=capture.path if people is None else people.path,
         estimates=_lens_and_scale(capture, camera, people),
-    )
+    )  # fmt: skip
 
 
 def _lens_and_scale(capture: Capture, camera: Camera, people: Located | None) -> tuple[str, ...]:
