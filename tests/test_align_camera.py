@@ -17,8 +17,8 @@ from mover.stages.camera.align_camera import (
     cost_of,
     covariance_of,
     fit_plane,
+    vote,
 )
-from mover.stages.camera.foot_votes import vote
 from mover.stages.config import AlignConfig
 
 PITCH, ROLL, GROUND = math.radians(-11), math.radians(1.5), -1.6

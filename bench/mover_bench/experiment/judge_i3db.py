@@ -14,8 +14,7 @@ from mover.core.errors import InputError
 from mover.core.observe import Observer, Step, silent
 from mover.core.run import Run
 from mover.core.types import Bodies, Camera, Capture, Scene, SceneObject
-from mover.evaluate.aligned import Together, iou3d_aligned
-from mover.evaluate.scene import Pair, iou3d
+from mover.evaluate.scene import Pair, Together, iou3d, iou3d_aligned
 from mover.fitting.bodies import FitInputs, fit_bodies
 from mover.geometry.camera import pitch_roll, tilted
 from mover.geometry.rle import decode

@@ -42,8 +42,8 @@ CHUNK = 32  # bodies decoded at once
 def neighbours(faces: Int[np.ndarray, "faces 3"], count: int) -> tuple[list[list[int]], int]:
     """Neighbours of each vertex, clockwise, and how many triangles did not fit and were left out.
 
-    Triangles are inserted in order. About a vertex they form fans, rows of neighbours of which each
-    two next to one another have a triangle; the first fan begins at the stored half-edge.
+    About a vertex the triangles form fans, rows of neighbours of which each two next to one another
+    have a triangle; the first fan begins at the stored half-edge.
     """
     fans: list[list[list[int]]] = [[] for _ in range(count)]
     taken, inner, left_out = set[tuple[int, int]](), set[int](), 0
@@ -63,10 +63,7 @@ def neighbours(faces: Int[np.ndarray, "faces 3"], count: int) -> tuple[list[list
 
 
 def _joined(fans: list[list[int]], into: int, out: int) -> list[list[int]] | None:
-    """The fans of a vertex with a triangle from one neighbour to another.
-
-    They are the same where its last gap closes; None where it does not fit.
-    """
+    """The fans with one more triangle; the same where the last gap closes, None if it is odd."""
     ends = [fan for fan in fans if fan[-1] == into]
     starts = [fan for fan in fans if fan[0] == out]
     if not ends and not starts:
@@ -96,10 +93,8 @@ def spirals(
     """
     around, _ = neighbours(faces, len(verts))
 
-    def ring_outside(last: list[int], row: list[int]) -> list[int]:
-        """Of each vertex of a ring first what follows another of the ring."""
-        inner, taken = set(last), {*last, *row}
-        ring: dict[int, None] = {}
+    def ring_outside(last: list[int], row: list[int]) -> list[int]:  # each after one of the ring
+        inner, taken, ring = set(last), {*last, *row}, dict[int, None]()
         for near in (around[vertex] for vertex in last):
             start = next((k for k, n in enumerate(near) if n in inner), len(near))
             ring |= dict.fromkeys(n for n in (*near[start:], *near[:start]) if n not in taken)
@@ -118,12 +113,8 @@ def spirals(
     return np.asarray(rows, dtype=np.int64)
 
 
-def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and triangles in the order of the file; nothing is merged.
-
-    Raises:
-        InputError: If it is missing or is no such file.
-    """
+def _read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and triangles in the order of the file; nothing is merged."""
     try:
         rows = [line.split() for line in path.read_text().splitlines()]
         verts = [[float(w) for w in row[1:4]] for row in rows if row[:1] == ["v"]]
@@ -185,7 +176,7 @@ def load_posa(weights: Path, meshes: Path) -> Posa:
             f"{weights.name}: has {found[0]} numbers, {found[1]} of them in the decoder, "
             f"expected {COUNTS[channels][0]} and {COUNTS[channels][1]}"
         )
-    verts, faces = read_obj(meshes / "mesh_2.obj")
+    verts, faces = _read_obj(meshes / "mesh_2.obj")
     full, middle, coarse = LEVELS
     if len(verts) != coarse:
         raise InputError(f"mesh_2.obj: has {len(verts)} vertices, expected {coarse}")
@@ -238,10 +229,7 @@ def canonical(
     pelvis: Float[Tensor, "bodies 3"],
     turn: Float[Tensor, "bodies 3 3"],
 ) -> Float[Tensor, "bodies verts 3"]:
-    """Vertices about the pelvis without heading and roll: x to the person's left, y down, z back.
-
-    They are given in the world (+y up), with the pelvis and the rotation of the root [m].
-    """
+    """World vertices [m] about the pelvis without heading and roll: x left, y down, z back."""
     flip = torch.diag(torch.tensor([1.0, -1.0, -1.0])).to(verts)
     root = flip @ turn.to(verts)
     tilt = rot_x(torch.atan2(-root[:, 1, 2], root[:, 1, 1]))

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from mover.bodies.parts import BodyParts, members
 from mover.bodies.skeleton import SIDES
-from mover.bodies.skin import LANDMARKS, PARTS
+from mover.bodies.skin import LANDMARKS, SOLES
 from mover.core.records import record
-from mover.core.types import Bodies
+from mover.core.types import Bodies, rows_by_person
 from mover.geometry.mesh import vertex_normals
 
 LEVEL_THIGH = 37.0  # [degrees] from level, at most, of a sitter's thighs
@@ -70,9 +70,7 @@ def speeds(
     result = torch.zeros_like(points[..., 0])
     if bodies.fps is None:
         return result
-    for person in bodies.person.unique().tolist():
-        row = torch.nonzero(bodies.person == person)[:, 0]
-        row = row[torch.argsort(bodies.frame[row])]
+    for row in rows_by_person(bodies.frame, bodies.person):
         time = bodies.frame[row].double() / bodies.fps
         first, last = _window(time)
         way = (points[row[last]] - points[row[first]]).norm(dim=-1)
@@ -310,7 +308,7 @@ def _stand(bodies: Bodies, parts: BodyParts, ground: Height) -> Float[Tensor, "b
     floor = _ramp((lowest[:, 0] - ground).abs(), FLOATS[1], FLOATS[0])[:, None]
     near = _ramp(height - lowest, SOLE[1], SOLE[0]) * floor
     chance = torch.zeros_like(near)
-    for name in PARTS[:2]:
+    for name in SOLES:
         part = members(parts, name)
         if part.any():
             middle = bodies.verts[:, part].mean(1, keepdim=True)

@@ -14,6 +14,7 @@ PARTS = (
     "left_palm", "right_palm", "left_forearm", "right_forearm",
 )  # fmt: skip
 """Patches of skin; of thighs and forearms only the undersides."""
+SOLES = PARTS[:2]
 LANDMARKS = (
     "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle", "neck",
     "left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist",

@@ -182,6 +182,14 @@ class Keypoints:
     fps: float | None
 
 
+def rows_by_person(
+    frame: Int[Tensor, " rows"], person: Int[Tensor, " rows"]
+) -> list[Int[Tensor, " _"]]:
+    """Rows of each person, in the order of their frames."""
+    every = (torch.nonzero(person == one)[:, 0] for one in person.unique().tolist())
+    return [rows[torch.argsort(frame[rows], stable=True)] for rows in every]
+
+
 @record
 class CameraPath:
     """Where the camera was in the frames, in the axes of the reference image's camera.

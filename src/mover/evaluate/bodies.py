@@ -9,6 +9,7 @@ from torch import Tensor
 
 from mover.bodies.parts import members, parts_of
 from mover.bodies.skeleton import BODY
+from mover.bodies.skin import SOLES
 from mover.core.records import record
 from mover.core.types import Bodies, Camera
 from mover.evaluate.scene import Metric
@@ -16,8 +17,6 @@ from mover.geometry.rotations import similarity
 from mover.io.capture.pose_file import into_camera
 from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
 from mover.stages.config import FootContactConfig
-
-SOLES = ("left_sole", "right_sole")
 
 
 @record

@@ -115,10 +115,10 @@ def gather_touch(
     """
     picked = evenly(len(bodies.frame), count)
     near = nearness(bodies.verts[picked], bodies.frame[picked], furniture, reach)
-    if truth is None or bodies.verts.shape[1] != truth.bodies.verts.shape[1]:
-        return Touch(near, None, None, reach)
-    rows, true_rows = shared_rows(bodies, truth.bodies)
-    if len(rows) == 0:
+    rows = true_rows = picked[:0]
+    if truth is not None and bodies.verts.shape[1] == truth.bodies.verts.shape[1]:
+        rows, true_rows = shared_rows(bodies, truth.bodies)
+    if truth is None or len(rows) == 0:
         return Touch(near, None, None, reach)
     same = torch.equal(rows, picked)
     shared = near if same else nearness(bodies.verts[rows], bodies.frame[rows], furniture, reach)

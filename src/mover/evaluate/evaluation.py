@@ -6,7 +6,7 @@ Definitions, matching rules and sampling densities: docs/metrics.md.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -14,15 +14,14 @@ from torch import Tensor
 
 from mover.bodies.corrected import in_world
 from mover.bodies.parts import members, parts_of
-from mover.core.records import map_tensors, record
+from mover.bodies.skin import SOLES
+from mover.core.records import record
 from mover.core.run import Run
 from mover.core.settings import Count, Metres, int_in
 from mover.core.types import Bodies, Mesh, Scene
-from mover.evaluate.aligned import SCENE_METRICS, Together
 from mover.evaluate.bodies import (
     GROUND_METRICS,
     POSE_METRICS,
-    SOLES,
     Standing,
     feet_places,
     gather_twins,
@@ -42,10 +41,13 @@ from mover.evaluate.scene import (
     CAMERA_METRICS,
     HARM_METRICS,
     OBJECT_METRICS,
+    SCENE_METRICS,
     SIDES,
     Metric,
     Pair,
     Sight,
+    Together,
+    doubled,
     means_of,
     measure,
     measure_objects,
@@ -59,8 +61,6 @@ from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.camera_file import camera_of
 from mover.io.capture.scene_file import read_scene
 from mover.io.files.fields import read_json, write_json
-
-T = TypeVar("T")
 
 METRICS: dict[str, Metric[Any]] = {
     **OBJECT_METRICS,
@@ -199,8 +199,7 @@ def evaluate_folder(
     )
     bodies = EvaluatedBodies(initial_people, people, true_people)
     initial, result = read_scene(out / "initial.json"), read_scene(out / "scene.json")
-    own = truth / "camera.json"
-    true = read_scene(truth / "scene.json", camera_of(read_json(own)) if own.exists() else None)
+    true = read_truth(truth)
     metrics = evaluate(initial, result, true, bodies, config)
     metrics["unmatched"] = unmatched(initial, result, true)
     if physics and (missing := lacking()) is not None:
@@ -210,6 +209,12 @@ def evaluate_folder(
             metrics[side] |= measure(PHYSICS_METRICS, settle(scene, Run(out)))
     write_json(metrics, out / "metrics.json")
     return metrics
+
+
+def read_truth(folder: Path) -> Scene:
+    """The true scene in a folder, for its own camera where it has one."""
+    own = folder / "camera.json"
+    return read_scene(folder / "scene.json", camera_of(read_json(own)) if own.exists() else None)
 
 
 def table(metrics: Mapping[str, Any], shown: Sequence[str] | None = None) -> str:
@@ -290,15 +295,11 @@ def _populate(scenes: tuple[Scene, Scene, Scene], people: EvaluatedBodies) -> li
 
 def _populated(scene: Scene, bodies: Bodies | None, closed: Mapping[str, Mesh]) -> _Populated:
     if bodies is None:
-        return _Populated(_double(scene), None, torch.zeros(0, dtype=torch.long), ())
+        return _Populated(doubled(scene), None, torch.zeros(0, dtype=torch.long), ())
     soles = soles_of(bodies, scene.camera)
-    furniture = _double(tuple(furniture_of(scene.objects, closed)))
-    people = in_world(_double(bodies), scene.camera)
-    return _Populated(_double(scene), people, soles, furniture)
-
-
-def _double(value: T) -> T:
-    return map_tensors(lambda x: x.double() if x.is_floating_point() else x, value)
+    furniture = doubled(tuple(furniture_of(scene.objects, closed)))
+    people = in_world(doubled(bodies), scene.camera)
+    return _Populated(doubled(scene), people, soles, furniture)
 
 
 def _true_touch(

@@ -11,7 +11,7 @@ from mover.bodies import BodyModel, run_model
 from mover.bodies.skinning import FLAT, SkinnedBody, growth_of, shaped, widths_of
 from mover.core.observe import Energy, Observer, Step, silent
 from mover.core.records import record, rows_of
-from mover.core.types import Bodies, BodyPose, Camera, Keypoints
+from mover.core.types import Bodies, BodyPose, Camera, Keypoints, rows_by_person
 from mover.fitting import ground, tracks
 from mover.fitting.config import FitConfig, Stage
 from mover.fitting.energy import FitState
@@ -235,7 +235,7 @@ def _laid(state: FitState, keypoints: Keypoints) -> FitState:
         return state
     at, seen = state.at, state.seen
     time = keypoints.frame / keypoints.fps
-    rows = tracks.tracks_of(keypoints.frame, keypoints.person)
+    rows = rows_by_person(keypoints.frame, keypoints.person)
     with torch.no_grad():
         joints = state.points.joints
     about = ground.distances_of_lying_people(joints, seen.up, rows, time)

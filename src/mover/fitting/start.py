@@ -29,13 +29,13 @@ from mover.bodies.transfer import ANGLES, as_smplx, find_matrix, read_matrix
 from mover.core.errors import InputError
 from mover.core.observe import Energy
 from mover.core.records import record, rows_of, with_rows
-from mover.core.types import Bodies, BodyPose, Camera, Keypoints
+from mover.core.types import Bodies, BodyPose, Camera, Keypoints, rows_by_person
 from mover.energy.body_terms import robust_square
 from mover.fitting.config import FitConfig, Stage
 from mover.fitting.energy import FitState, Seen
 from mover.fitting.ground import LIES, NEIGHBOURS, SITS, trunk_of
 from mover.fitting.priors import resting, spreads
-from mover.fitting.tracks import best_path, every_so_often, tracks_of
+from mover.fitting.tracks import best_path, every_so_often
 from mover.fitting.unknowns import Frame, Rig, Unknowns, place_of, points_of, solve
 from mover.geometry.camera import project
 from mover.geometry.rotations import axis_angle, rot_x, rot_y, rot_z
@@ -206,7 +206,7 @@ def begin(
     R = camera.R_cam_world.to(like)
     tracks = [
         (track, None if fps is None else keypoints.frame[rows][track] / fps)
-        for track in tracks_of(keypoints.frame[rows], keypoints.person[rows])
+        for track in rows_by_person(keypoints.frame[rows], keypoints.person[rows])
     ]
 
     def tried(guess: Guess, rows: Int[Tensor, " some"]) -> Tried:

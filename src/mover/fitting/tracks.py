@@ -10,7 +10,7 @@ from mover.bodies.keypoints import LAYOUTS
 from mover.bodies.skeleton import BODY, PARENTS
 from mover.core.errors import InputError
 from mover.core.records import record
-from mover.core.types import Camera, Keypoints
+from mover.core.types import Camera, Keypoints, rows_by_person
 from mover.energy.body_terms import gather_neighbours
 from mover.fitting.config import FitConfig, Stage
 from mover.fitting.energy import Seen, TrackMotion
@@ -55,18 +55,6 @@ def windows_of(keypoints: Keypoints, config: FitConfig) -> list[Window]:
     return found
 
 
-# Rows of the same person in the order of time.
-
-
-def tracks_of(frame: Int[Tensor, " rows"], person: Int[Tensor, " rows"]) -> list[Int[Tensor, " _"]]:
-    """Rows of each person, in the order of their frames."""
-    found: list[Tensor] = []
-    for one in person.unique().tolist():
-        rows = torch.nonzero(person == one)[:, 0]
-        found.append(rows[torch.argsort(frame[rows], stable=True)])
-    return found
-
-
 def motion_of(
     keypoints: Keypoints, speed: Float[Tensor, "rows joints"] | None, config: FitConfig
 ) -> TrackMotion:
@@ -104,7 +92,7 @@ def joint_speed(
     each, names = torch.full(there.shape, torch.nan), LAYOUTS[keypoints.layout]
     ones = there[..., None].to(keypoints.points)
     known = torch.where(there[..., None], keypoints.points, 0.0)
-    for rows in tracks_of(keypoints.frame, keypoints.person):
+    for rows in rows_by_person(keypoints.frame, keypoints.person):
         time = keypoints.frame[rows].to(known) / keypoints.fps
         clock = time[:, None, None] * ones[rows]
         sums = torch.cat([known[rows], clock, ones[rows]], -1)
@@ -133,7 +121,7 @@ def every_so_often(
     picked: list[Tensor] = []
     nearest = torch.zeros(len(frame), dtype=torch.long)
     count = 0
-    for rows in tracks_of(frame, person):
+    for rows in rows_by_person(frame, person):
         some = rows[torch.arange(min(step // 2, len(rows) - 1), len(rows), step)]
         way = (frame[rows][:, None] - frame[some][None]).abs()
         nearest[rows] = count + way.argmin(1)

@@ -23,7 +23,7 @@ from mover.core.errors import InputError
 from mover.core.observe import Observer
 from mover.core.records import fingerprint
 from mover.core.run import Run
-from mover.core.types import Camera, Keypoints, People
+from mover.core.types import Camera, Keypoints, People, rows_by_person
 from mover.geometry.rle import decode
 from mover.io.capture.annotations_file import (
     detections_of,
@@ -175,9 +175,7 @@ def restless(joints: Keypoints) -> bool:
     names = LAYOUTS[joints.layout]
     trunk = [names.index(f"{side}_{part}") for side in SIDES for part in ("shoulder", "hip")]
     bends = [torch.zeros(1)]
-    for person in joints.person.unique():
-        mine = (joints.person == person).nonzero()[:, 0]
-        mine = mine[joints.frame[mine].argsort()]
+    for mine in rows_by_person(joints.frame, joints.person):
         points, frame = joints.points[mine], joints.frame[mine]
         tall = (points.amax(1) - points.amin(1)).amax(-1).median()
         middle = points[:, trunk].mean(1)

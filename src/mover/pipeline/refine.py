@@ -13,11 +13,10 @@ from mover.bodies.posa import load_posa, posa_contacts
 from mover.core.errors import InputError
 from mover.core.observe import Observer, silent
 from mover.core.types import Bodies, Capture, Room
-from mover.evaluate.evaluation import evaluate_people
+from mover.evaluate.evaluation import evaluate_people, read_truth
 from mover.geometry.placement import standing_meshes
 from mover.io.capture.bodies_file import read_bodies, write_bodies
 from mover.io.capture.camera_file import camera_of
-from mover.io.capture.scene_file import read_scene
 from mover.io.export.finished import read_finished
 from mover.io.files.fields import At, read_json, write_json
 from mover.io.files.meshes import read_mesh
@@ -112,9 +111,7 @@ def measure_people(out: Path, truth: Path | None = None) -> dict[str, dict[str, 
 
 def _true_people(truth: Path) -> Bodies:
     """The people of a truth, in its world."""
-    own = truth / "camera.json"
-    scene = read_scene(truth / "scene.json", camera_of(read_json(own)) if own.exists() else None)
-    bodies = read_bodies(truth / "bodies.npz")
+    scene, bodies = read_truth(truth), read_bodies(truth / "bodies.npz")
     return bodies if bodies.space == "world" else to_world(bodies, scene.camera)
 
 

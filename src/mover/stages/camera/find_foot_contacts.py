@@ -12,17 +12,17 @@ from torch import Tensor
 
 from mover.bodies.parts import BodyParts, members
 from mover.bodies.posture import at, landmarks
+from mover.bodies.skeleton import SIDES
+from mover.bodies.skin import SOLES
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
-from mover.core.types import Bodies, Camera
+from mover.core.types import Bodies, Camera, rows_by_person
 from mover.energy.human_terms import FootContacts
 from mover.stages.config import FootContactConfig
 
 KNEE, HIP = 145.0, 140.0  # [degrees], a leg is straight whose knee and hip are opened wider ...
 UPRIGHT = 60.0  # [degrees] ... and that leans less
 POINTS = 4  # lowest vertices of a sole that count
-SIDES = ("left", "right")
-SOLES = tuple(f"{side}_sole" for side in SIDES)
 TOUCHING = 0.5  # the paper's threshold
 WITHIN = 0.5  # [s] between two frames that still show whether a foot moved
 FAR_ENOUGH = 0.15  # [s] between them, at least, where the video has them: jitter is no motion
@@ -93,18 +93,16 @@ def _best_evidence(
     feet: _LowerFeet, sound: Bool[Tensor, " bodies"]
 ) -> tuple[Bool[Tensor, " bodies"], tuple[str, ...]]:
     """The strictest choice that leaves something, and what to say about it."""
+    bent = "no person ever stands on a straight leg: the lowest still feet give the floor"
     levels = (
-        (feet.carries & feet.still, ()),
-        (feet.carries, ("no standing foot is ever still: moving feet give the floor",)),
-        (
-            feet.still,
-            ("no person ever stands on a straight leg: the lowest still feet give the floor",),
-        ),
-        (sound, ("no foot is ever still: the lowest point of every body gives the floor",)),
+        (feet.carries & feet.still, ""),
+        (feet.carries, "no standing foot is ever still: moving feet give the floor"),
+        (feet.still, bent),
+        (sound, "no foot is ever still: the lowest point of every body gives the floor"),
     )
-    for chosen, warnings in levels:
+    for chosen, warning in levels:
         if bool((chosen & sound).any()):
-            return chosen & sound, warnings
+            return chosen & sound, (warning,) if warning else ()
     raise AssertionError("some body is sound")
 
 
@@ -173,9 +171,7 @@ def _still(
     still = torch.ones(len(foot), dtype=torch.bool, device=foot.device)
     if bodies.fps is None:
         return still
-    for person in bodies.person.unique():
-        rows = (bodies.person == person).nonzero()[:, 0]
-        rows = rows[bodies.frame[rows].argsort()]
+    for rows in rows_by_person(bodies.frame, bodies.person):
         time = bodies.frame[rows].to(foot.dtype) / bodies.fps
         still[rows] = _rests(foot[rows], time, speed)
     return still
@@ -188,10 +184,7 @@ def _rests(
     last = len(time) - 1
     after = torch.searchsorted(time, time + FAR_ENOUGH - 1e-4).clamp_max(last)
     before = (torch.searchsorted(time, time - FAR_ENOUGH + 1e-4, right=True) - 1).clamp_min(0)
-    known, rests = (
-        torch.zeros_like(time, dtype=torch.bool),
-        torch.zeros_like(time, dtype=torch.bool),
-    )
+    known = rests = torch.zeros_like(time, dtype=torch.bool)
     for other in (before, after):
         wait = (time - time[other]).abs()
         near = (wait > 0) & (wait <= WITHIN)

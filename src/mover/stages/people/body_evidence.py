@@ -9,7 +9,7 @@ from torch import Tensor
 from mover.bodies.corrected import spread
 from mover.bodies.parts import BodyParts, members
 from mover.bodies.posture import speeds
-from mover.bodies.skin import PARTS
+from mover.bodies.skin import PARTS, SOLES
 from mover.core.records import record
 from mover.core.types import Bodies, Camera, Capture, Mesh, Room
 from mover.energy.body_contact import Surface
@@ -20,10 +20,9 @@ from mover.geometry.placement import place_object
 from mover.geometry.raster import first_hit
 from mover.geometry.volume import Volume, grid_around
 from mover.geometry.volume_warp import union_bodies
-from mover.stages.masks import MaskTable, small_camera, small_masks
+from mover.stages.masks import MaskTable, small_camera, small_masks, widened
 from mover.stages.objects.find_image_cues import image_evidence
 
-SOLES = ("left_sole", "right_sole")
 CELL = 0.025  # [m], of the furniture's volume
 MOST_CELLS = 320  # along its longest side
 SAMPLES = 1500  # points on the surface of each object
@@ -220,7 +219,7 @@ def order_bounds(
     for row in rows.tolist():
         own, others = small_masks(torch.stack(table.decode(row)), room.camera)
         both = torch.stack([own, ~(own | others)])
-        masks.append(_shrunk(both) & (table.own[row] is not None))
+        masks.append(~widened(~both, INNER) & (table.own[row] is not None))
     shown, away = torch.stack(masks, 1)
     body = torch.arange(len(rows))[:, None].expand_as(x)
     return bounds_of_skin(
@@ -232,9 +231,3 @@ def order_bounds(
             room.loose[y, x],
         )
     )
-
-
-def _shrunk(masks: Bool[Tensor, "masks h w"]) -> Bool[Tensor, "masks h w"]:
-    inverse = (~masks).float()[:, None]
-    size = 2 * INNER + 1
-    return torch.nn.functional.max_pool2d(inverse, size, stride=1, padding=INNER)[:, 0] < 0.5

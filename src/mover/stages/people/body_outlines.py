@@ -12,7 +12,7 @@ from mover.energy.body_terms import OUTLINE_POINTS, Outline
 from mover.geometry.camera import project
 from mover.geometry.raster import Crops, layers
 from mover.stages.contacts.assign_contacts import evenly
-from mover.stages.masks import MaskTable
+from mover.stages.masks import MaskTable, widened
 
 SIDE = 160  # [px] of a body's window
 AROUND = 1.3  # window over the longer side of the body's box
@@ -58,7 +58,7 @@ def gather_outlines(seen: SeenBodies, table: MaskTable, rows: Int[Tensor, " bodi
                 found.append(replace(one, body=one.body + first))
     pair, one = seen.skin.new_zeros(0, 2).float(), torch.zeros(0, dtype=torch.long)
     found.append(Outline(one, one, pair, pair, pair[:, 0], pair[:, 0]))
-    names = [field.name for field in fields(Outline)]
+    names = (field.name for field in fields(Outline))
     return Outline(**{name: torch.cat([getattr(o, name) for o in found]) for name in names})
 
 
@@ -89,13 +89,14 @@ def _compare(
         return None
     depth = drawn[body].median()
     front = _sampled(seen.front, window, seen.camera)
-    blocked = _grown(others | (front < depth + BEHIND) | _outside(window, seen.camera))
+    outside = _outside(window, seen.camera)
+    blocked = widened((others | (front < depth + BEHIND) | outside)[None], SPREAD)[0]
     away = _signed(own)
     normal, rises = _slope(_signed(body)), _slope(away)
     agree = (normal * rises).sum(0) > ALONG
     near = away.abs() < REACH * seen.camera.width * zoom
-    inner = torch.nn.functional.max_pool2d((~body).float()[None, None], 3, 1, 1)[0, 0] < 0.5
-    y, x = (body & ~inner & ~blocked & agree & near).nonzero(as_tuple=True)
+    edge = body & widened(~body[None], 1)[0]
+    y, x = (edge & ~blocked & agree & near).nonzero(as_tuple=True)
     if len(y) < LEAST:
         return None
     gap = (away[y, x] + 0.5) / zoom
@@ -147,11 +148,6 @@ def _outside(window: Float[Tensor, "3"], camera: Camera) -> Bool[Tensor, "side s
     return rows[:, None] | columns[None]
 
 
-def _grown(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
-    size = 2 * SPREAD + 1
-    return torch.nn.functional.max_pool2d(mask.float()[None, None], size, 1, SPREAD)[0, 0] > 0.5
-
-
 def _signed(mask: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     """Distance from the outline, negative inside [px]."""
     from scipy.ndimage import distance_transform_edt
@@ -164,9 +160,7 @@ def _signed(mask: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
 
 def _slope(image: Float[Tensor, "h w"]) -> Float[Tensor, "2 h w"]:
     """Direction in which a distance grows, along x and y."""
-    smooth = torch.nn.functional.avg_pool2d(image[None, None], 5, 1, 2, count_include_pad=False)[
-        0, 0
-    ]
-    down, right = torch.gradient(smooth)
+    smooth = torch.nn.functional.avg_pool2d(image[None], 5, 1, 2, count_include_pad=False)
+    down, right = torch.gradient(smooth[0])
     both = torch.stack([right, down])
     return both / both.norm(dim=0).clamp_min(1e-6)
