@@ -54,21 +54,16 @@ MIDDLE: dict[str, tuple[Range, Range, Range]] = {
 STIFFNESS = 1 / math.radians(4.0)  # beyond a limit four degrees are one standard deviation
 
 
-def limits_of(joint: str) -> tuple[Range, Range, Range]:
-    """Limits, rest and spread of a joint of the body about x, y and z [degrees]."""
-    if joint in MIDDLE:
-        return MIDDLE[joint]
-    side, name = joint.split("_")
-    x, y, z = LEFT[name]
-    if side == "right":
-        y, z = ((-high, -low, -rest, spread) for low, high, rest, spread in (y, z))
-    return x, y, z
-
-
 @lru_cache(maxsize=1)
 def limit_table() -> Float[Tensor, "4 63"]:
     """Lowest, highest, rest and spread of all angles of the body [rad]."""
-    rows = [axis for name in BODY[1:] for axis in limits_of(name)]
+    rows = list[Range]()
+    for joint in BODY[1:]:
+        side, _, name = joint.rpartition("_")
+        x, y, z = LEFT[name] if side else MIDDLE[name]
+        if side == "right":
+            y, z = ((-high, -low, -rest, spread) for low, high, rest, spread in (y, z))
+        rows += [x, y, z]
     return torch.deg2rad(torch.tensor(rows, dtype=torch.float64)).mT.contiguous()
 
 

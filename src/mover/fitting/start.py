@@ -105,9 +105,8 @@ class Tried(FitStart):
 
 def upright_guesses(like: Tensor) -> list[Guess]:
     """Standing and sitting people who face four ways."""
-    turns = rot_y(torch.tensor(YAWS).to(like)).unbind(0)
+    turns, usual = rot_y(torch.tensor(YAWS).to(like)).unbind(0), spreads(1, like)[0]
     poses = [_posed(angles, like) for angles in (STANDING, SEATED)]
-    usual = spreads(1, like)[0]
     return [Guess(pose, usual, turn, True) for pose in poses for turn in turns]
 
 
@@ -129,22 +128,16 @@ def lying_guesses(like: Tensor, rolls: tuple[float, ...]) -> list[Guess]:
     return [Guess(pose, spread, turn @ side, False) for side in sides for turn in turns]
 
 
-def before(pose: Float[Tensor, "bodies code"]) -> Float[Tensor, "bodies 3"]:
-    """A place in front of the camera for each body [m]."""
-    return pose.new_tensor([[0, 0, BEFORE]]).expand(len(pose), -1)
-
-
-def unknowns_at(pose: Float[Tensor, "bodies code"], pelvis: Float[Tensor, "bodies 3"]) -> Unknowns:
-    """Bodies at rest but for this pose and place, all of one person's usual shape."""
-    none = pose.new_zeros(len(pose), 0)
-    return Unknowns(
-        torch.zeros_like(pelvis), pose, place_of(pelvis), pose.new_zeros(1, 1), none, none
-    )
+def before(pose: Float[Tensor, "bodies code"]) -> Unknowns:
+    """Bodies in this pose before the camera, all of one person's usual shape."""
+    none, pelvis = pose.new_zeros(len(pose), 0), pose.new_tensor([[0, 0, BEFORE]])
+    place = place_of(pelvis.expand(len(pose), -1))
+    return Unknowns(torch.zeros_like(place), pose, place, pose.new_zeros(1, 1), none, none)
 
 
 def where_seen(at: Unknowns, frame: Frame, seen: Seen) -> Unknowns:
     """Bodies that are `before` the camera, put where it sees their keypoints."""
-    origin = points_of(at, frame).keypoints - before(at.code)[:, None]
+    origin = points_of(at, frame).keypoints - at.code.new_tensor([0, 0, BEFORE])
     torso = torch.tensor([n in TORSO for n in frame.rig.names], device=origin.device)
     enough = ((seen.weight > 0) & torso).sum(1, keepdim=True) >= 3
     weight = torch.where(enough & ~torso, 0.2 * seen.weight, seen.weight)
@@ -232,7 +225,7 @@ def begin(
 def _tried(guess: Guess, seen: Seen, R: Float[Tensor, "3 3"], rig: Rig, config: FitConfig) -> Tried:
     """One hypothesis fitted to all rows."""
     body = guess.pose.expand(len(seen.pixels), -1)
-    at = unknowns_at(body, before(body))
+    at = before(body)
     spread = guess.spread.expand_as(body)
     narrow = 2 * (seen.spread / spread).log().sum(-1)
     seen = dataclasses.replace(seen, centre=body, spread=spread)
@@ -384,7 +377,7 @@ def begin_from(start: Bodies, keypoints: Keypoints, seen: Seen, rig: Rig) -> Fit
     angles = pose.body_pose[rows, :ANGLES].float()
     root = axis_angle(pose.global_orient[rows].float())
     frame = Frame(rig, root, torch.zeros(len(angles), dtype=torch.long))
-    at = where_seen(unknowns_at(angles, before(angles)), frame, seen)
+    at = where_seen(before(angles), frame, seen)
     return FitStart(at, root, angles, torch.full_like(seen.spread, NEAR))
 
 

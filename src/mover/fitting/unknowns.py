@@ -60,8 +60,12 @@ def rig_of(model: SkinnedBody, layout: str, used: Bool[Tensor, " layout"]) -> Ri
     needed = torch.unique(vertex[joint < 0])
     small = vertex_subset(model, needed)
     on_body = not any(kind_of(name) == "hand" or "jaw" in name for name in names)
-    if small.pose_dirs is None and on_body:
-        small = _of_first_joints(small, len(BODY))
+    if small.pose_dirs is None and on_body:  # none of its vertices follows another joint
+        part, n = rows_of(small, torch.arange(len(BODY)), "joints"), len(BODY)
+        small = dataclasses.replace(
+            part, joint_names=small.joint_names[:n], parents=small.parents[:n],
+            weights=part.weights / part.weights.sum(1, keepdim=True),
+        )  # fmt: skip
     count = len(small.parents)
     mix = torch.zeros(len(index), count + len(needed))
     is_joint = joint >= 0
@@ -73,15 +77,6 @@ def rig_of(model: SkinnedBody, layout: str, used: Bool[Tensor, " layout"]) -> Ri
     first = torch.searchsorted(needed, vertex[:, 0].contiguous()).clamp_max(len(needed) - 1)
     bones = torch.where(is_joint, parents[joint.clamp_min(0)], small.weights[first].argmax(1))
     return Rig(small, mix, index, names, bones)
-
-
-def _of_first_joints(skin: SkinnedBody, joints: int) -> SkinnedBody:
-    """The body with its first joints only; none of its vertices follows another one."""
-    first = rows_of(skin, torch.arange(joints), "joints")
-    return dataclasses.replace(
-        first, joint_names=skin.joint_names[:joints], parents=skin.parents[:joints],
-        weights=first.weights / first.weights.sum(1, keepdim=True),
-    )  # fmt: skip
 
 
 def move(

@@ -50,6 +50,7 @@ from mover.perceive.video import PICTURES, Clip, TakeInputs, rate_of, stamp_of, 
 from mover.stages.camera.find_lens import LensInputs, find_lens, zoomed
 from mover.stages.camera.room_lines import find_segments
 from mover.stages.config import LensConfig
+from mover.stages.masks import pixels_of
 
 log = logging.getLogger(__name__)
 BEND, OFTEN = 0.15, 0.9  # of the height: second difference of the trunk, and of how many frames
@@ -351,18 +352,14 @@ def read_picture_of(folder: Path) -> Picture:
     detections = detections_of(parts.objects, camera, log.warning)
     blank = torch.zeros(camera.height, camera.width, dtype=torch.bool)
     masks = [blank if d.mask is None else decode(d.mask, 0) for d in detections]
-    hidden = blank
-    if parts.people is not None:
-        reference = people_of(parts.people, camera, log.warning).reference
-        for row in range(0 if reference is None else len(reference.counts)):
-            assert reference is not None
-            hidden = hidden | decode(reference, row)
+    people = None if parts.people is None else people_of(parts.people, camera, log.warning)
+    reference = None if people is None else people.reference
     known, depth = given.maybe("height"), find_depth_file(folder)
     return Picture(
         camera=camera,
         detections=detections,
         masks=torch.stack(masks) if masks else blank[None][:0],
-        people=hidden,
+        people=blank if reference is None else pixels_of(reference),
         height=None if known is None else known.number(0.1, 100.0),
         depth=None
         if depth is None or not depth[1]  # in metres

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from mover.core.settings import Seconds, Share, Sigma, Weight, float_in, int_in
+from mover.core.settings import Seconds, Share, Weight, float_in, int_in
 from mover.energy.config import Adam, SceneWeights
 from mover.stages.config import ImageConfig, PlaceConfig, PrepareConfig
 
@@ -64,30 +64,13 @@ class ScreenConfig:
     )  # fmt: skip
     """Heights of the camera that are tried [m]."""
     usual: Annotated[float, float_in(0.1, 20)] = 1.5
-    """The usual one [m],"""
-    spread: Annotated[float, float_in(1e-3, 10)] = 0.4
-    """and how much it varies (of its logarithm)."""
-    known: Sigma = 0.05
-    """Standard deviation of a height estimated from people or depth (of its logarithm), where
-    bodies.npz gives no prior of people's heights."""
-    yaws: Annotated[int, int_in(1, 360)] = 8
-    """Turns that are tried."""
-    scale: Weight = 0.3
-    """Weight of usual sizes against boxes."""
-    depth: Weight = 0.5
-    """Weight of measured depth, where there is any."""
+    """The usual one [m]."""
     tilt: Annotated[float, float_in(0, 1.5)] = math.radians(3)
     """How wrong pitch and roll may be [rad]; 0: not at all."""
     tilt_known: Annotated[float, float_in(0, 1.5)] = math.radians(1)
     """The same where the height is known, too [rad]."""
-    axis: Weight = 0.15
-    """Weight of the axis along which a thing may stand, where the picture shows it."""
     prior: Weight = 0.03
     """Weight of usual heights and tilts."""
-    cap: Weight = 0.3
-    """Most that one object may say about the height."""
-    soft: Sigma = 0.05
-    """Shapes that fit worse than the best by so much hardly count."""
     method: Adam = field(default_factory=lambda: Adam(100, 0.05, 0.005, beta2=0.98))
     """The descent."""
 

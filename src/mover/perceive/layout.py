@@ -210,15 +210,15 @@ def first_scene(
     skipped = tuple(d.category for k, d in enumerate(picture.detections) if k not in placed)
     if not placed:
         return FirstScene(Scene(picture.camera, None, ()), (), skipped)
-    picture = replace(
-        picture,
-        detections=tuple(picture.detections[k] for k in placed),
-        masks=picture.masks[placed],
-    )
-    picture = at_scale(picture)
+    found = tuple(picture.detections[k] for k in placed)
+    picture = at_scale(replace(picture, detections=found, masks=picture.masks[placed]))
     shapes = [shapes_of(d.category, config.shapes, meshes) for d in picture.detections]
     pairs = [(thing, shape) for thing, known in enumerate(shapes) for shape in known]
-    cues = run.stage(find_image_cues, _image(picture), config.image)
+    boxes = torch.stack([d.box for d in picture.detections])
+    masks, hidden = picture.masks, picture.people
+    seen, behind = torch.ones(len(boxes), dtype=torch.bool), order_in_image(masks, hidden)
+    image = ImageInputs(picture.camera, boxes, seen, masks, hidden, behind)
+    cues = run.stage(find_image_cues, image, config.image)
     screened = run.stage(screen, _screen_inputs(picture, cues, pairs), config.screen)
     camera = replace(picture.camera, R_cam_world=screened.R_cam_world)
     picture = replace(picture, camera=camera)
@@ -311,13 +311,6 @@ def at_scale(picture: Picture) -> Picture:
     if seen is None or not 1 / MOST_OFF < height / seen < MOST_OFF:
         return picture
     return replace(picture, depth=picture.depth * (height / seen))
-
-
-def _image(picture: Picture) -> ImageInputs:
-    boxes = torch.stack([d.box for d in picture.detections])
-    seen = torch.ones(len(boxes), dtype=torch.bool)
-    behind = order_in_image(picture.masks, picture.people)
-    return ImageInputs(picture.camera, boxes, seen, picture.masks, picture.people, behind)
 
 
 def _screen_inputs(

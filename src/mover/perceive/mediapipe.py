@@ -145,7 +145,8 @@ def people_in(
         points = places @ M[:, :2].T + M[:, 2]
         cover = expit(out[1, 256, 256, 1][0, ..., 0])
         mask = cv2.warpAffine(cover.astype(np.float32), M, (w, h)) > INSIDE
-        if mask.any() and not any(_shared(mask, other) > TWICE for *_, other in kept):
+        others = [(mask & o).sum() / max(1, min(mask.sum(), o.sum())) for *_, o in kept]
+        if mask.any() and not any(shared > TWICE for shared in others):
             kept.append((points, expit(rows[:33, 3]), mask))
     return kept
 
@@ -294,11 +295,6 @@ def without_furniture(poses: Poses, furniture: Bool[Tensor, "h w"], margin: floa
         less = mask & ~(furniture & ~torch.from_numpy(near).bool())
         kept.append(encode(less if bool(less.any()) else mask))
     return replace(poses, masks=replace(poses.masks, counts=tuple(kept)))
-
-
-def _shared(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
-    """Shared area of two masks over that of the smaller one."""
-    return float((a & b).sum() / max(1, min(a.sum(), b.sum())))
 
 
 @lru_cache(maxsize=4)

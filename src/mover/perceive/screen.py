@@ -30,6 +30,12 @@ LITTLE = 0.01  # share of items that are not the best
 AROUND = (-1.5, -0.75, 0.0, 0.75, 1.5)  # standard deviations of the height of a prior
 NEAREST = 0.6  # [m], where a start is put at least
 FARTHEST = 15.0  # [m], and at most
+SPREAD = 0.4  # of the logarithm of usual heights of cameras,
+KNOWN = 0.05  # and of one that is given, or by people or depth without a prior of their heights
+YAWS = 8  # turns that are tried
+SCALE, DEPTH, AXIS = 0.3, 0.5, 0.15  # weights of usual sizes, measured depth, axes seen in pictures
+CAP = 0.3  # most that one object may say about the height
+SOFT = 0.05  # shapes that fit worse than the best by so much hardly count
 
 
 @record
@@ -79,10 +85,6 @@ class Screened:
     """Of the camera above the floor [m]."""
     R_cam_world: Float[Tensor, "3 3"]
     """Of the camera with its tilt corrected."""
-    curve: Float[Tensor, " heights"]
-    """What the things cost together, from each height at which the descent began."""
-    heights: Float[Tensor, " heights"]
-    """Where it ended from there [m]."""
     layout: Layout
     """Each item in each turn on the floor of that height."""
     energy: Float[Tensor, "yaws items"]
@@ -101,18 +103,18 @@ def outermost(verts: Float[Tensor, "verts 3"]) -> Float[Tensor, "points 3"]:
 def screen(inputs: ScreenInputs, config: ScreenConfig, observe: Observer = silent) -> Screened:
     """Begin at all heights, descend, choose the best."""
     heights = _heights(inputs, config)
-    start = _starts(inputs, config, heights)
+    start = _starts(inputs, heights)
 
     def energy(guess: ScreenGuess) -> Energy:
         each = _each(guess, inputs, config)
-        share = _share(each, inputs, config)
+        share = _share(each, inputs)
         world = _world(guess, inputs, config)
         return Energy({"items": (each * share).sum((1, 2)), "world": world})
 
     found = minimize(energy, start, config.method, observe, "screen").at
     with torch.no_grad():
         each = _each(found, inputs, config)
-        things = _best_of_things(inputs, each.amin(1)).clamp_max(config.cap)
+        things = _best_of_things(inputs, each.amin(1)).clamp_max(CAP)
         curve = things.sum(-1) + _world(found, inputs, config)
         best = int(curve.argmin())
         layout = _standing(found)
@@ -122,8 +124,6 @@ def screen(inputs: ScreenInputs, config: ScreenConfig, observe: Observer = silen
     return Screened(
         height=float(found.log_height[best].exp()),
         R_cam_world=R if config.tilt else inputs.camera.R_cam_world,
-        curve=curve,
-        heights=found.log_height.exp(),
         layout=Layout(layout.t_world_object[best], layout.yaw[best], layout.log_scale[best]),
         energy=each[best],
     )
@@ -138,7 +138,7 @@ def _best_of_things(
 
 
 def _share(
-    each: Float[Tensor, "heights yaws items"], inputs: ScreenInputs, config: ScreenConfig
+    each: Float[Tensor, "heights yaws items"], inputs: ScreenInputs
 ) -> Float[Tensor, "heights yaws items"]:
     """How much an item in a turn moves camera and floor.
 
@@ -147,9 +147,9 @@ def _share(
     """
     with torch.no_grad():
         best = _best_of_things(inputs, each.amin(1))
-        share = ((best[:, None, inputs.thing] - each) / config.soft).exp().clamp_min(LITTLE)
+        share = ((best[:, None, inputs.thing] - each) / SOFT).exp().clamp_min(LITTLE)
         votes = torch.zeros_like(best).index_add(1, inputs.thing, share.sum(1))
-        vote = (1 + best / config.cap) ** -2 / votes
+        vote = (1 + best / CAP) ** -2 / votes
         return share * vote[:, None, inputs.thing]
 
 
@@ -169,9 +169,9 @@ def _world(
         at = torch.stack(pitch_roll(inputs.camera.R_cam_world)) + guess.tilt
         off = torch.cat([at, guess.log_height[:, None]], -1) - inputs.prior.mean
         return config.prior * torch.einsum("hi,ij,hj->h", off, inputs.prior.precision, off)
-    usual, spread, tilt = config.usual, config.spread, config.tilt
+    usual, spread, tilt = config.usual, SPREAD, config.tilt
     if inputs.height is not None:
-        usual, spread, tilt = inputs.height, config.known, config.tilt_known
+        usual, spread, tilt = inputs.height, KNOWN, config.tilt_known
     tilt = tilt if inputs.tilt_spread is None else inputs.tilt_spread
     height = ((guess.log_height - math.log(usual)) / spread).square()
     turned = (guess.tilt / max(tilt, 1e-3)).square().sum(-1)
@@ -195,11 +195,11 @@ def _each(
     verts = place(inputs.points, _standing(guess)) @ R.mT
     boxes, sides = inputs.boxes[thing], inputs.sides[thing]
     box = bbox_term(project(verts, camera.K), boxes, sides, float(camera.width), "robust")
-    size = config.scale * scale_term(guess.log_scale, "robust")
-    energy = box + size + config.depth * _off_depth(verts, inputs.depth[thing])
+    size = SCALE * scale_term(guess.log_scale, "robust")
+    energy = box + size + DEPTH * _off_depth(verts, inputs.depth[thing])
     if inputs.given is None:
         return energy
-    return energy + config.axis * given_term(_standing(guess), inputs.given)
+    return energy + AXIS * given_term(_standing(guess), inputs.given)
 
 
 def _off_depth(
@@ -213,7 +213,7 @@ def _off_depth(
     return torch.where(depth.isnan(), torch.zeros_like(off), off)
 
 
-def _starts(inputs: ScreenInputs, config: ScreenConfig, heights: Tensor) -> ScreenGuess:
+def _starts(inputs: ScreenInputs, heights: Tensor) -> ScreenGuess:
     """On the floor below the box where its lower edge is seen, else as far as its usual size says.
 
     An item whose floor point is not plausible (above the horizon) starts by its size, too.
@@ -231,10 +231,10 @@ def _starts(inputs: ScreenInputs, config: ScreenConfig, heights: Tensor) -> Scre
     usable = (rays[0][:, 1] < -0.02) & (inputs.sides[inputs.thing][:, 3] == SEEN) & (far < FARTHEST)
     distance = torch.where(usable, far, by_size.expand_as(far)).clamp(NEAREST, FARTHEST)
     t = distance[..., None] * torch.where(usable[..., None], rays[0], rays[1])
-    yaw = torch.arange(config.yaws)[:, None] * (2 * math.pi / config.yaws)
+    yaw = torch.arange(YAWS)[:, None] * (2 * math.pi / YAWS)
     if inputs.given is not None:
         yaw = yaw + inputs.given.axis
-    shape = (len(heights), config.yaws, len(boxes))
+    shape = (len(heights), YAWS, len(boxes))
     return ScreenGuess(
         t_world_object=t[:, None].expand(*shape, 3).clone(),
         yaw=yaw.expand(shape).clone(),

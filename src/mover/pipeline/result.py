@@ -4,6 +4,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -17,7 +18,7 @@ from mover.geometry.volume import sample
 from mover.io.capture.pose_file import into_camera
 from mover.pipeline.estimates import lens_and_scale, odd_sizes, odd_statures
 from mover.pipeline.objects import Arrangement, Humans, Setup
-from mover.pipeline.people import Located, estimate_people
+from mover.pipeline.people import Located, check_floor, estimate_people
 from mover.pipeline.presets import ROBUST
 from mover.stages.contacts.diagnostics import DiagnosticInputs, diagnostics
 from mover.stages.contacts.label_contacts import LabelInputs
@@ -43,13 +44,20 @@ def unfurnished(capture: Capture, people: Located | None) -> Room:
     warnings = capture.warnings
     if people is not None:
         warnings += (*people.warnings, *_odd_people(people, camera))
+    bodies = None if people is None else to_world(people.bodies, camera)
+    return _room(
+        capture, people, scene=scene, image_only=scene, bodies=bodies, proxies=(), evidence=(),
+        traces={}, warnings=warnings,
+    )  # fmt: skip
+
+
+def _room(capture: Capture, people: Located | None, scene: Scene, **found: Any) -> Room:  # noqa: ANN401
+    """What was found, with what the people and the capture say of the whole room."""
     return Room(
-        scene=scene, initial=capture.scene, image_only=scene,
-        bodies=None if people is None else to_world(people.bodies, camera),
-        kept=None if people is None else people.kept, proxies=(), evidence=(),
-        covariance=None if found is None else found.covariance, traces={}, warnings=warnings,
+        scene=scene, initial=capture.scene, kept=None if people is None else people.kept,
+        covariance=None if people is None else people.alignment.covariance,
         path=capture.path if people is None else people.path,
-        estimates=_lens_and_scale(capture, camera, people),
+        estimates=_lens_and_scale(capture, scene.camera, people), **found,
     )  # fmt: skip
 
 
@@ -72,15 +80,11 @@ def furnished(
                 prepared.objects, placed.layout, humans.contacts.points,
                 humans.contacts.seated_on, people.path,
             ))  # fmt: skip
-    return Room(
-        scene=Scene(camera, placed.ground, objects), initial=capture.scene,
-        image_only=Scene(camera, placed.ground, by_image), bodies=bodies,
-        kept=None if people is None else people.kept, proxies=proxy_meshes(prepared),
-        evidence=_evidence(setup, placed, humans),
-        covariance=None if people is None else people.alignment.covariance, traces=placed.traces,
+    return _room(
+        capture, people, scene=Scene(camera, placed.ground, objects), bodies=bodies,
+        image_only=Scene(camera, placed.ground, by_image), proxies=proxy_meshes(prepared),
+        evidence=_evidence(setup, placed, humans), traces=placed.traces,
         warnings=tuple(dict.fromkeys(warnings)),
-        path=capture.path if people is None else people.path,
-        estimates=_lens_and_scale(capture, camera, people),
     )  # fmt: skip
 
 
@@ -152,8 +156,6 @@ def warnings_of(capture: Capture) -> tuple[tuple[str, ...], tuple[str, ...]]:
     Raises:
         InputError: What it would refuse.
     """
-    from mover.pipeline.people import check_floor
-
     with tempfile.TemporaryDirectory() as folder:
         people = estimate_people(capture, ROBUST, Run(Path(folder)))
     ground, camera = capture.scene.ground, capture.scene.camera

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from mover.core.settings import Count, Metres, Share, Sigma, Weight, float_in, int_in
+from mover.core.settings import Count, Metres, Share, Weight, float_in, int_in
 from mover.energy.config import (
     GROWTH,
     REFINE,
@@ -233,11 +233,7 @@ class RefineBodiesConfig:
     """The descent of one round that changes poses too."""
     rounds: Annotated[int, int_in(1, 1000)] = 3
     """How often contacts and depth order are looked for again."""
-    rhos: tuple[Sigma, Sigma] = (0.15, 0.06)
-    """Distances at which a contact pays half, in the first and in the last round [m]."""
     rows: Annotated[int, int_in(1, 100_000)] = 512
     """Bodies that are moved at once."""
     overlap: Annotated[int, int_in(0, 10_000)] = 12
     """Rows on both sides that are moved along."""
-    plant: bool = True
-    """Whether soles at rest are put still at the end (where `weights.lock` is not 0)."""

@@ -59,6 +59,8 @@ from mover.stages.people.body_evidence import (
 from mover.stages.people.body_outlines import SeenBodies, gather_outlines
 from mover.stages.people.plant_feet import plant_feet
 
+RHOS = (0.15, 0.06)  # [m], where a contact costs half of the most, in the first and last round
+
 
 @dataclass(frozen=True)
 class BodyEvidence:
@@ -292,11 +294,12 @@ def _at_one_time(
     scene = replace(room.scene, objects=tuple(piece for piece, _ in still))
     room = replace(room, proxies=tuple(proxy for _, proxy in still))
     if capture is not None:
-        ids = {piece.id for piece, _ in still}
+        ids, touch = {piece.id for piece, _ in still}, capture.touch
         given = tuple(piece for piece in capture.scene.objects if piece.id in ids)
-        capture = replace(capture, scene=replace(capture.scene, objects=given))
-    if capture is not None and capture.touch is not None:
-        capture = replace(capture, touch=capture.touch[rows])
+        capture = replace(
+            capture, scene=replace(capture.scene, objects=given),
+            touch=None if touch is None else touch[rows],
+        )  # fmt: skip
     return replace(room, scene=scene, bodies=bodies, kept=None), capture
 
 
@@ -319,7 +322,7 @@ def _refined(
         found = with_rows(found, inner, rows_of(by, keep))
         energy[inner] = left[keep]
     bodies, shift = corrected(scene.bodies, found), found.shift
-    if config.plant and config.weights.lock:
+    if config.weights.lock:  # soles at rest are put still
         planted = plant_feet(bodies, parts_of(bodies), scene.room.floor)
         shift = shift + (planted.verts - bodies.verts).mean(1)
         bodies = planted
@@ -344,7 +347,7 @@ def _refine(
         now, method = (stiff, config.place) if turn < config.places else (puppet, config.method)
         by = _started(now, by)
         share = turn / max(1, total - 1)
-        rho = config.rhos[0] * (config.rhos[1] / config.rhos[0]) ** share
+        rho = RHOS[0] * (RHOS[1] / RHOS[0]) ** share
         known = gathered(scene, rows, bodies, MovedBodies(by, now, known), config.weights)
         state = MovedBodies(by, now, replace(known, rho=rho))
 
