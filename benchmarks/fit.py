@@ -14,12 +14,12 @@ import torch
 from torch import Tensor
 
 from mover.bodies.skinning import open_body, shaped
-from mover.core.types import Camera, Keypoints
+from mover.core.types import Camera, Keypoints, People
 from mover.evaluate.bodies import procrustes
 from mover.fitting.bodies import FitInputs, Fitted, fit_bodies
 from mover.geometry.camera import project
 from mover.perceive.config import ModelsConfig
-from mover.perceive.networks import JointsInputs, Tracks
+from mover.perceive.networks import JointsInputs
 from mover.perceive.video import Clip
 from mover_bench.rooms.config import NoiseConfig, RoomConfig
 from mover_bench.rooms.known import KnownRoom, make_room
@@ -38,7 +38,7 @@ def detected(room: KnownRoom, seed: int, fps: float) -> tuple[Keypoints, Camera]
     count = int(people.frame.max()) + 1
     clip = Clip("", camera.width, camera.height, torch.arange(count) / fps, fps)
     seen = Seen(room, noisy, seed)
-    tracks = Tracks(people.masks, people.frame, people.person)
+    tracks = People(people.masks, people.frame, people.person)
     return seen.joints(JointsInputs(clip, tracks), ModelsConfig()), camera
 
 

@@ -17,11 +17,11 @@ import torch
 from PIL import Image
 
 from mover.core.observe import Observer, silent
-from mover.core.types import Keypoints, Masks
+from mover.core.types import Keypoints, Masks, People
 from mover.geometry.rle import decode, encode, tight_box
 from mover.perceive.capture import Finders
 from mover.perceive.config import ModelsConfig, PerceiveConfig
-from mover.perceive.networks import PERSON, DetectInputs, Finds, JointsInputs, Tracks
+from mover.perceive.networks import PERSON, DetectInputs, Finds, JointsInputs
 from mover.perceive.video import Clip, read_picture
 
 COLOURS = {PERSON: (225, 30, 200), "chair": (20, 190, 60)}
@@ -158,7 +158,7 @@ def joints(inputs: JointsInputs, _config: ModelsConfig, _observe: Observer = sil
     )  # fmt: skip
 
 
-def no_network(inputs: object, _config: object, _observe: Observer = silent) -> Tracks:
+def no_network(inputs: object, _config: object, _observe: Observer = silent) -> People:
     raise AssertionError(f"a network is asked for {inputs}")
 
 

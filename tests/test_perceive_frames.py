@@ -16,7 +16,6 @@ from mover.perceive.config import FramesConfig, Lens
 from mover.perceive.reference import LEAST, median
 from mover.perceive.steady import (
     Drift,
-    SteadyInputs,
     align,
     find_drift,
     moved,
@@ -117,7 +116,7 @@ def load_frame(path: Path) -> torch.Tensor:
 
 
 def found_in(clip: Clip) -> tuple[Drift, list[str]]:
-    drift = find_drift(SteadyInputs(clip))
+    drift = find_drift(clip)
     return drift, warnings_of(drift, clip.time)
 
 
@@ -248,7 +247,7 @@ def test_the_swaying_bedroom_is_steadied(tmp_path: Path):
     pytest.importorskip("av")
     raw = take(BEDROOM, tmp_path / "raw", FramesConfig(fps=5))
     assert (raw.width, raw.height, raw.fps, len(raw.time)) == (960, 540, 5.0, 34)
-    drift = find_drift(SteadyInputs(raw))
+    drift = find_drift(raw)
     assert drift.verdict == "sways"
     assert away(drift, -1, np.array([[480.0, 270.0]])) == pytest.approx(56, abs=3)
     steady = steady_frames(raw, drift, tmp_path / "steady")

@@ -11,7 +11,7 @@ import torch
 from tiny_models import tiny_mask2former, tiny_vitpose
 
 from mover.core.errors import InputError
-from mover.core.types import Masks
+from mover.core.types import Masks, People
 from mover.geometry.rle import decode, encode
 from mover.perceive.config import ModelsConfig, PerceiveConfig
 from mover.perceive.networks import (
@@ -20,7 +20,6 @@ from mover.perceive.networks import (
     Finds,
     JointsInputs,
     Network,
-    Tracks,
     find_instances,
     find_joints,
     instances,
@@ -150,12 +149,12 @@ def test_joints_of_all_people_are_found_row_by_row(folders: ModelsConfig, tmp_pa
     clip = clip_of(tmp_path, 3)
     code = encode(mask(slice(20, 80), slice(40, 85)))
     zeros = torch.zeros(20, dtype=torch.long)
-    tracks = Tracks(Masks(H, W, (code,) * 20), torch.arange(20) % 3, zeros)
+    tracks = People(Masks(H, W, (code,) * 20), torch.arange(20) % 3, zeros)
     found = find_joints(JointsInputs(clip, tracks), folders)
     assert found.points.shape == (20, 17, 2)
     assert found.layout == "coco17"
     assert found.points.isfinite().all()
-    empty = Tracks(Masks(H, W, ()), zeros[:0], zeros[:0])
+    empty = People(Masks(H, W, ()), zeros[:0], zeros[:0])
     assert find_joints(JointsInputs(clip, empty), folders).points.shape == (0, 17, 2)
 
 

@@ -12,12 +12,12 @@ from test_lens import FOCAL, camera_of, drawn
 from tiny_models import tiny_mask2former, tiny_vitpose
 
 from mover.core.run import Run
-from mover.core.types import Keypoints, Masks
+from mover.core.types import Keypoints, Masks, People
 from mover.geometry.rle import decode, encode
 from mover.io.people.keypoints import read_keypoints
 from mover.perceive.capture import Finders, Video, lens_by_lines, perceive, restless
 from mover.perceive.config import FramesConfig, Lens, ModelsConfig, PerceiveConfig
-from mover.perceive.networks import Finds, Tracks
+from mover.perceive.networks import Finds
 from mover.perceive.reference import Clean, detections_in, grown, hidden_mask, reference_of
 from mover.perceive.steady import Drift
 from mover.perceive.video import Clip, write_jpeg
@@ -77,7 +77,7 @@ def test_the_reference_is_the_room_without_the_walker(tmp_path: Path):
         masks[k, 20:90, 10 + 12 * k : 30 + 12 * k] = True
     codes = tuple(encode(mask) for mask in masks)
     zeros = torch.zeros(FRAMES, dtype=torch.long)
-    tracks = Tracks(Masks(H, W, codes), torch.arange(FRAMES), zeros)
+    tracks = People(Masks(H, W, codes), torch.arange(FRAMES), zeros)
     still = Drift(torch.eye(3).expand(FRAMES, 3, 3), torch.ones(FRAMES), 0, 0.0, "still")
     clean = reference_of(clip_of(tmp_path / "f"), still, tracks)
     assert not clean.hidden.any()

@@ -8,7 +8,7 @@ import torch
 
 from mover.core.types import Bodies
 from mover.stages.config import SelectConfig
-from mover.stages.people.select_frames import LOCAL, SelectInputs, select_frames
+from mover.stages.people.select_frames import LOCAL, select_frames
 
 SHARED = Path(__file__).parents[2] / "shared"
 
@@ -24,7 +24,7 @@ def bodies_of(joints, frame, fps: float | None = 30.0, person=None, names=("pelv
 
 
 def kept(bodies, **config):
-    return select_frames(SelectInputs(bodies), SelectConfig(**config)).keep.numpy()
+    return select_frames(bodies, SelectConfig(**config)).keep.numpy()
 
 
 def walk_and_sit(seconds=8.0, fps=30.0, seed=0):

@@ -20,12 +20,12 @@ from torch import Tensor
 from mover.bodies.keypoints import LAYOUTS, SIDES, keypoints_of
 from mover.bodies.skinning import open_body
 from mover.core.observe import Observer, silent
-from mover.core.types import Camera, Capture, Keypoints, Masks
+from mover.core.types import Camera, Capture, Keypoints, Masks, People
 from mover.geometry.camera import project
 from mover.geometry.rle import decode
 from mover.perceive.capture import Finders
 from mover.perceive.config import ModelsConfig, PerceiveConfig
-from mover.perceive.networks import PERSON, DetectInputs, Finds, JointsInputs, Tracks
+from mover.perceive.networks import PERSON, DetectInputs, Finds, JointsInputs
 from mover.perceive.video import Clip
 from mover_bench.rooms.known import KnownRoom, draw_frame
 from mover_bench.rooms.noise import slow
@@ -106,7 +106,7 @@ class Seen:
             frame=tracks.frame, person=tracks.person, fps=inputs.clip.fps,
         )  # fmt: skip
 
-    def _bodies(self, tracks: Tracks, frames: list[int]) -> Int[Tensor, " rows"]:
+    def _bodies(self, tracks: People, frames: list[int]) -> Int[Tensor, " rows"]:
         """The true body of each row of the tracks, which are numbered as people appear."""
         bodies, people = self.room.bodies, self.noisy.people
         assert people is not None

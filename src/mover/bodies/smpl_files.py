@@ -1,4 +1,4 @@
-"""The arrays of a file of the SMPL family, checked, as a body model."""
+"""Body models from the user's own files of the SMPL family, checked; none is shipped."""
 
 import os
 import zipfile
@@ -181,9 +181,6 @@ def _face(arrays: Mapping[str, Any], faces: NDArray[np.int64], file: str) -> Fac
     index = _indices(arrays, "lmk_faces_idx", (51,), len(faces), file)
     share = _numbers(arrays, "lmk_bary_coords", (51, 3), file)
     return FacePoints(torch.from_numpy(faces[index]), _tensor(share))
-
-
-# Finds and reads the user's own files of the SMPL family; none is shipped.
 
 
 FOLDER = "MOVER_BODY_MODELS"

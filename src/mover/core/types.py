@@ -1,5 +1,6 @@
 """The nouns of the package, with shapes and units. Frames, axes and pixels: docs/conventions.md."""
 
+from dataclasses import field
 from typing import Literal
 
 import torch
@@ -127,7 +128,7 @@ class People:
     masks: Masks
     frame: Int[Tensor, " rows"]
     person: Int[Tensor, " rows"]
-    heights: dict[str, float]
+    heights: dict[str, float] = field(default_factory=dict)
     """Known body heights by track [m]."""
 
 

@@ -257,9 +257,6 @@ def _speed(state: FitState, keypoints: Keypoints) -> Float[Tensor, "rows joints"
     return pixels * log_depth(state.at, state.frame).exp()[:, None] / state.seen.K[0, 0]
 
 
-# What was solved, as bodies.
-
-
 def pose_of(at: Unknowns, frame: Frame, model: SkinnedBody) -> BodyPose:
     """Parameters of the fitted bodies."""
     angles = frame.prior.decode(at.code)

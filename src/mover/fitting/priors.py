@@ -119,9 +119,6 @@ def off_pose(
     return level.index_add(1, away.new_tensor(ANKLES, dtype=torch.long), away[:, KNEES])
 
 
-# Stature and proportions.
-
-
 ADULT, ADULTS = 1.68, 0.10  # [m], mean and spread of adults of either sex (NCD-RisC 2016)
 UNKNOWN = ADULTS / ADULT  # standard deviation of the logarithm of an unknown height
 BONES = 4.6  # [m], the 21 bones of a usual person end to end
@@ -194,9 +191,6 @@ def size_of(joints: Float[Tensor, "bodies joints 3"]) -> Float[Tensor, " bodies"
     body = joints[:, : len(BODY)]
     bones = body[:, 1:] - body[:, list(PARENTS[1 : len(BODY)])]
     return bones.square().sum(-1).clamp_min(1e-12).sqrt().sum(-1) / BONES
-
-
-# Keypoints of a detector.
 
 
 LASTING = {"hip": 0.03, "pelvis": 0.03, "neck": 0.03, "shoulder": 0.02, "knee": 0.02}

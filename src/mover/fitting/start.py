@@ -313,9 +313,6 @@ def _path(
     return best_path(cost, SWITCH * strain.clamp_max(STRAIN))
 
 
-# From the bodies of another tool.
-
-
 def start_rows(
     start: Bodies, keypoints: Keypoints, K: Float[Tensor, "3 3"]
 ) -> Int[Tensor, " rows"]:

@@ -145,9 +145,6 @@ def best_path(
     return torch.tensor(path[::-1])
 
 
-# Which keypoints count, and how much.
-
-
 def confidence_of(keypoints: Keypoints, config: FitConfig) -> Float[Tensor, "rows layout"]:
     """Confidence of keypoints, 0 where they are missing, not finite, or below the least."""
     sure = keypoints.confidence.nan_to_num(0).clamp(0, 1)

@@ -105,9 +105,6 @@ def move(
     return Points(keypoints, places + shift)
 
 
-# What is solved, and what it means: joints' rotations, shapes, places.
-
-
 HAND = 45
 NO_FLOOR = torch.zeros(0)
 NO_OFFSETS = torch.zeros(0, 0, 3)

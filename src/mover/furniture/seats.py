@@ -1,4 +1,4 @@
-"""Sofas and beds: what one sits, leans and lies on."""
+"""Sofas, beds, chairs, stools and benches: what one sits, leans and lies on."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -125,9 +125,6 @@ def _slats(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float
     at, inner = np.linspace(x[0] + 0.04, x[1] - 0.04, 6), (z[0] + 0.01, z[1] - 0.01)
     bars = upright(at, 0.03, (y[0] - 0.1, y[1] - 0.02), inner)
     return [rail, *bars, *upright((x[0] + 0.035, x[1] - 0.035), 0.035, (0, y[1]), z)]
-
-
-# Chairs, armchairs, office chairs, stools and benches.
 
 
 def chair(rng: np.random.Generator, style: int) -> Furniture:

@@ -42,10 +42,10 @@ from mover.perceive import mediapipe, networks
 from mover.perceive.config import Lens, ModelsConfig, PerceiveConfig
 from mover.perceive.layout import FirstScene, Picture
 from mover.perceive.mediapipe import PoseInputs, Poses, find_poses
-from mover.perceive.networks import DetectInputs, Finds, JointsInputs, Tracks
+from mover.perceive.networks import DetectInputs, Finds, JointsInputs
 from mover.perceive.own import Own, own_keypoints, own_masks, own_objects, same_people
 from mover.perceive.reference import Clean, clip_of_clean, detections_in, hidden_mask, reference_of
-from mover.perceive.steady import Drift, SteadyInputs, find_drift, steady_frames, warnings_of
+from mover.perceive.steady import Drift, find_drift, steady_frames, warnings_of
 from mover.perceive.video import PICTURES, Clip, TakeInputs, rate_of, stamp_of, take_frames
 from mover.stages.camera.find_lens import LensInputs, find_lens, zoomed
 from mover.stages.camera.room_lines import find_segments
@@ -131,9 +131,7 @@ def perceive(
     given = {name: at.value[name] for name in LENS_FIELDS if at.value.get(name) is not None}
     camera, by_lines = lens_by_lines(camera, given.get("focal_spread"), clean, say)
     write_json({**camera_to_json(camera), **given, **by_lines}, out / "camera.json")
-    people = None
-    if tracks.masks.counts:
-        people = People(tracks.masks, clip.numbers[tracks.frame], tracks.person, {})
+    people = replace(tracks, frame=clip.numbers[tracks.frame]) if tracks.masks.counts else None
     tree = people_to_json(people, hidden_mask(clean), clip.fps, clip.numbers.tolist())
     write_json(tree, out / "people.json")
     if joints is not None and len(joints.frame):
@@ -156,16 +154,15 @@ def outlined(objects: dict[str, Any] | None, camera: Camera) -> Bool[Tensor, "h 
 
 def moving_people(
     video: Video, out: Path, config: PerceiveConfig, run: Run, say: Say, finders: Finders
-) -> tuple[Clip, Drift, Tracks, Keypoints | None, Poses | None]:
+) -> tuple[Clip, Drift, People, Keypoints | None, Poses | None]:
     """The steadied clip, and the people in it, at as many frames a second as their motion needs."""
     most = min(DENSEST, rate_of(video.source, replace(config.frames, fps=0.0)) or 0.0)
     while True:
         clip, drift = steady_clip(video.source, out, config, run, say)
         found = people_of_clip(clip, drift, video.own, config, run, say, finders)
         joints, faster = found[1], min(2 * (clip.fps or 0.0), most)
-        if joints is None or video.own.keypoints is not None or faster <= (clip.fps or 0.0):
-            return clip, drift, *found
-        if not restless(joints):
+        enough = video.own.keypoints is not None or faster <= (clip.fps or 0.0)
+        if joints is None or enough or not restless(joints):
             return clip, drift, *found
         say(f"people move fast: {faster:g} frames a second are taken")
         config = replace(config, frames=replace(config.frames, fps=faster))
@@ -192,7 +189,7 @@ def steady_clip(
     raw = out / "perceived" / "raw" / f"{config.frames.fps:g}"
     taken = TakeInputs(source, stamp_of(source), raw)
     whole = run.stage(take_frames, taken, config.frames)
-    drift = run.stage(find_drift, SteadyInputs(whole), None)
+    drift = run.stage(find_drift, whole, None)
     for text in warnings_of(drift, whole.time):
         say(f"warning: {text}")
     raw = whole.part(drift.first, drift.first + len(drift.agree))
@@ -206,7 +203,7 @@ def steady_clip(
 
 def people_of_clip(
     clip: Clip, drift: Drift, own: Own, config: PerceiveConfig, run: Run, say: Say, finders: Finders
-) -> tuple[Tracks, Keypoints | None, Poses | None]:
+) -> tuple[People, Keypoints | None, Poses | None]:
     """People's masks and joints in all frames: those of the user, of MediaPipe, or of networks.
 
     Returns:
@@ -220,7 +217,7 @@ def people_of_clip(
     if own.masks is not None:
         tracks, poses = own_masks(own.masks, clip, drift, say), None
     elif poses is not None:
-        tracks = Tracks(poses.masks, poses.frame, poses.person)
+        tracks = People(poses.masks, poses.frame, poses.person)
     else:
         count = len(clip.time)
         chunks = [tuple(range(k, min(k + CHUNK, count))) for k in range(0, count, CHUNK)]

@@ -21,7 +21,7 @@ from torch import Tensor
 from mover.core.errors import InputError
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
-from mover.core.types import Keypoints, Masks
+from mover.core.types import Keypoints, Masks, People
 from mover.geometry.rle import decode, encode, joined, tight_box
 from mover.io.people.found import followed
 from mover.perceive.config import ModelsConfig, PerceiveConfig
@@ -45,17 +45,14 @@ class Network:
     device: str
 
 
+@lru_cache(maxsize=4)
 def network(kind: str, config: ModelsConfig) -> Network:
     """The network of a kind, `masks` or `keypoints`, on the GPU if there is one; loaded once.
 
     Raises:
         InputError: If transformers or the weights are missing; the message says what to do.
     """
-    return _loaded(kind, str(getattr(config, kind)))
-
-
-@lru_cache(maxsize=4)
-def _loaded(kind: str, name: str) -> Network:
+    name = str(getattr(config, kind))
     try:
         library: Any = importlib.import_module("transformers")
     except ImportError as error:
@@ -68,7 +65,7 @@ def _loaded(kind: str, name: str) -> Network:
             processor = library.AutoImageProcessor.from_pretrained(name, **here)
     except (OSError, ValueError, KeyError, ImportError) as error:
         log.debug("loading %s: %s", name, error)
-        raise InputError(absent(kind, replace(ModelsConfig(), **{kind: name}))) from error
+        raise InputError(absent(kind, config)) from error
     device = "cuda" if torch.cuda.is_available() else "cpu"
     return Network(model.to(device).eval(), processor, device)
 
@@ -164,16 +161,7 @@ def overlap(a: Bool[Tensor, "n h w"], b: Bool[Tensor, "m h w"]) -> Float[Tensor,
     return shared / (flat[0].sum(1)[:, None] + flat[1].sum(1)[None] - shared).clamp_min(1)
 
 
-@record
-class Tracks:
-    """People's masks, one row for each (frame, person)."""
-
-    masks: Masks
-    frame: Int[Tensor, " rows"]
-    person: Int[Tensor, " rows"]
-
-
-def link_people(found: Finds) -> Tracks:
+def link_people(found: Finds) -> People:
     """People of all frames, linked by where each was last seen."""
     kept = [k for k, name in enumerate(found.category) if name == PERSON]
     people = replace(found.masks, counts=tuple(found.masks.counts[k] for k in kept))
@@ -181,7 +169,7 @@ def link_people(found: Finds) -> Tracks:
     low, high = boxes.reshape(-1, 2, 2).swapaxes(0, 1)
     frames, size = found.frame[kept], np.linalg.norm(high - low, axis=1)
     person = followed(frames.tolist(), (low + high) / 2, size)
-    return Tracks(people, frames, torch.from_numpy(person))
+    return People(people, frames, torch.from_numpy(person))
 
 
 @record
@@ -189,7 +177,7 @@ class JointsInputs:
     """People in the frames of a clip."""
 
     clip: Clip
-    tracks: Tracks
+    tracks: People
 
 
 def find_joints(

@@ -15,14 +15,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.core.errors import InputError
-from mover.core.types import Keypoints, Masks
+from mover.core.types import Keypoints, Masks, People
 from mover.geometry.rle import decode, encode
 from mover.io.formats import names
 from mover.io.masks.instance_files import read_people, read_things
 from mover.io.masks.instances import Instance, Instances, objects_tree
 from mover.io.people.found import Known
 from mover.io.people.keypoints import keypoints_from, read_keypoints
-from mover.perceive.networks import Tracks
 from mover.perceive.steady import Drift, moved, warp
 from mover.perceive.video import Clip
 
@@ -83,7 +82,7 @@ def _read_joints(path: Path) -> Keypoints:
     raise InputError(f"{first}; known are keypoints.npz and {', '.join(names('keypoints'))}")
 
 
-def own_masks(path: Path, clip: Clip, drift: Drift, say: Callable[[str], None]) -> Tracks:
+def own_masks(path: Path, clip: Clip, drift: Drift, say: Callable[[str], None]) -> People:
     """People's masks of the frames that are taken, as the steadied camera sees them.
 
     Raises:
@@ -104,7 +103,7 @@ def own_masks(path: Path, clip: Clip, drift: Drift, say: Callable[[str], None]) 
             codes.append(encode(mask))
             kept.append(k)
     person = torch.tensor([items[rows[k]].track or 0 for k in kept], dtype=torch.long)
-    return Tracks(Masks(clip.height, clip.width, tuple(codes)), at[kept], person)
+    return People(Masks(clip.height, clip.width, tuple(codes)), at[kept], person)
 
 
 def own_objects(own: Own, clip: Clip, drift: Drift) -> dict[str, Any]:
@@ -171,7 +170,7 @@ def _taken(
     return torch.tensor(rows), torch.tensor(at)
 
 
-def same_people(keypoints: Keypoints, tracks: Tracks) -> Keypoints:
+def same_people(keypoints: Keypoints, tracks: People) -> Keypoints:
     """The joints under the numbers of the masks that hold most of them; others are numbered on."""
     from scipy.optimize import linear_sum_assignment
 

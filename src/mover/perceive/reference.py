@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mover.core.records import fingerprint, record
-from mover.core.types import Detection, Masks
+from mover.core.types import Detection, Masks, People
 from mover.geometry.rle import decode, encode, tight_box
-from mover.perceive.networks import Finds, Tracks, overlap, stack_of
+from mover.perceive.networks import Finds, overlap, stack_of
 from mover.perceive.steady import Drift, shown_by
 from mover.perceive.video import Clip, read_picture, write_jpeg
 
@@ -38,7 +38,7 @@ class Clean:
     """Pixels that no frame, or too few, show empty."""
 
 
-def reference_of(clip: Clip, drift: Drift, tracks: Tracks) -> Clean:
+def reference_of(clip: Clip, drift: Drift, tracks: People) -> Clean:
     """The room without people: the median of the frames that show a pixel empty.
 
     A person without a mask for some frames is in no median. Where too few frames show a pixel, it

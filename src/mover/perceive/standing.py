@@ -22,7 +22,7 @@ from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_
 from mover.stages.camera.find_lens import MEASURED, heading_of, tilt_of, tilted_by
 from mover.stages.camera.room_lines import SURE, Prior, find_segments, fit_room
 from mover.stages.config import AlignConfig, FootContactConfig, LensConfig, SelectConfig
-from mover.stages.people.select_frames import SelectInputs, select_frames
+from mover.stages.people.select_frames import select_frames
 from mover.stages.posterior import Gaussian, diagonal
 
 POSES = math.radians(2.0)  # [rad] by which a floor under fitted bodies leans: feet err together
@@ -70,7 +70,7 @@ def standing_on(picture: Picture, bodies: Bodies, run: Run) -> Picture:
     if bodies.space != "camera":
         return picture
     camera = picture.camera
-    keep = run.stage(select_frames, SelectInputs(bodies), SelectConfig()).keep
+    keep = run.stage(select_frames, bodies, SelectConfig()).keep
     parts = parts_of(bodies, camera.R_cam_world[:, 1])
     standing = FootContactInputs(bodies, parts, keep, camera)
     feet = run.stage(find_foot_contacts, standing, FootContactConfig())

@@ -142,16 +142,8 @@ def _of_centres(H: Matrix) -> Matrix:
     return np.linalg.inv(half) @ H @ half
 
 
-@record
-class SteadyInputs:
-    """The frames as they were taken."""
-
-    clip: Clip
-
-
-def find_drift(inputs: SteadyInputs, _config: None = None, observe: Observer = silent) -> Drift:
+def find_drift(clip: Clip, _config: None = None, observe: Observer = silent) -> Drift:
     """Align every frame with the first of its shot, each from where the one before ended."""
-    clip = inputs.clip
     starts, shots = [0], [_shot(clip, 0, observe)]
     while starts[-1] + len(shots[-1]) < len(clip.time):
         starts.append(starts[-1] + len(shots[-1]))

@@ -25,7 +25,7 @@ from mover.stages.camera.room_lines import FINE, SURE, Segments, find_segments
 from mover.stages.cover import hiding
 from mover.stages.objects.find_image_cues import people_in_reference
 from mover.stages.people.find_depth import DepthInputs, apply_depth, find_depth, size_spread
-from mover.stages.people.select_frames import SelectInputs, select_frames
+from mover.stages.people.select_frames import select_frames
 
 NO_POSA = (
     "contacts.npz: missing, so contacts are estimated from geometry where the paper has POSA's"
@@ -145,7 +145,7 @@ def chosen_people(capture: Capture, parts: BodyParts, config: Config, run: Run) 
     """Choose frames (Sec. 3.1) and, with masks, correct the depth of each person."""
     bodies, path, masks = capture.bodies, capture.path, capture.people
     assert bodies is not None
-    kept = run.stage(select_frames, SelectInputs(carried(bodies, path)), config.select).keep
+    kept = run.stage(select_frames, carried(bodies, path), config.select).keep
     if not config.correct_depth or masks is None:
         return ChosenPeople(bodies, kept, ())
     camera = capture.scene.camera

@@ -157,7 +157,7 @@ def fit_into(args: FitArgs, config: FitConfig | None = None) -> None:
     from mover.fitting.prior import prior_of
     from mover.io.capture.bodies_file import read_bodies, write_bodies
     from mover.pipeline.estimates import poor_fits
-    from mover.stages.people.select_frames import SelectInputs, select_frames
+    from mover.stages.people.select_frames import select_frames
 
     if args.model_folder is not None:
         os.environ["MOVER_BODY_MODELS"] = str(args.model_folder)
@@ -179,7 +179,7 @@ def fit_into(args: FitArgs, config: FitConfig | None = None) -> None:
     for warning in (*found.warnings, *poor_fits(bodies, found.miss, camera)):
         say(f"warning: {warning}")
     if args.drop:
-        keep = select_frames(SelectInputs(bodies)).keep
+        keep = select_frames(bodies).keep
         say(f"{int((~keep).sum())} of {len(keep)} bodies are left out by the frame filter")
         bodies = rows_of(bodies, keep)
     write_bodies(bodies, args.out)

@@ -39,13 +39,6 @@ Points = Float[np.ndarray, "frames points 3"]
 
 
 @record
-class SelectInputs:
-    """People who move."""
-
-    bodies: Bodies
-
-
-@record
 class Selection:
     """Which rows of the bodies give evidence."""
 
@@ -53,14 +46,13 @@ class Selection:
 
 
 def select_frames(
-    inputs: SelectInputs, config: SelectConfig = SelectConfig(), observe: Observer = silent
+    bodies: Bodies, config: SelectConfig = SelectConfig(), observe: Observer = silent
 ) -> Selection:
     """Find the frames in which a person moves as a person can.
 
     Each track is judged by itself, at its real times, so that gaps do no harm. Unordered images and
     tracks of fewer than three frames are kept whole.
     """
-    bodies = inputs.bodies
     keep = np.ones(len(bodies.frame), dtype=bool)
     if bodies.fps is None:
         return Selection(torch.from_numpy(keep))
