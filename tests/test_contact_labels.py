@@ -19,7 +19,7 @@ from mover.geometry.nearest import to_surface
 from mover.geometry.placement import StandingMesh
 from mover.io.export.contacts import export_contacts, read_labels, write_labels
 from mover.io.export.finished import read_finished
-from mover.stages.contacts.label_contacts import LabelConfig, LabelInputs, label_contacts
+from mover.stages.contacts.label_contacts import LabelInputs, label_contacts
 
 
 def standing(frames: int = 6) -> Bodies:
@@ -36,7 +36,7 @@ def standing(frames: int = 6) -> Bodies:
 def labelled(bodies: Bodies, *meshes: Mesh, floor: float | None = GROUND) -> ContactLabels:
     ids = tuple(f"box_{k}" for k in range(len(meshes)))
     stands = tuple((StandingMesh(mesh),) for mesh in meshes)
-    return label_contacts(LabelInputs(bodies, parts_of(bodies), stands, ids, floor), LabelConfig())
+    return label_contacts(LabelInputs(bodies, parts_of(bodies), stands, ids, floor))
 
 
 def shelf_beside(bodies: Bodies, side: str, gap: float) -> Mesh:

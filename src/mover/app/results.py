@@ -29,7 +29,7 @@ from mover.io.export.scene_glb import write_glb
 from mover.io.files.fields import read_json
 from mover.pipeline.presets import Config
 from mover.pipeline.result import label_inputs
-from mover.stages.contacts.label_contacts import LabelConfig, label_contacts
+from mover.stages.contacts.label_contacts import label_contacts
 
 POINTS = 500  # of a trace, about, that run.json keeps
 
@@ -80,7 +80,7 @@ def write_results(
 
 def labels_of(room: Room, run: Run) -> ContactLabels:
     """Who touches what in a finished room with people."""
-    return run.stage(label_contacts, label_inputs(room), LabelConfig())
+    return run.stage(label_contacts, label_inputs(room), None)
 
 
 def write_truth(scene: Scene, bodies: Bodies, folder: Path) -> None:

@@ -64,9 +64,8 @@ class LensEstimate:
     warnings: tuple[str, ...] = ()
 
 
-def find_lens(inputs: LensInputs, config: LensConfig, observe: Observer = silent) -> LensEstimate:
+def find_lens(inputs: LensInputs, _config: LensConfig, observe: Observer = silent) -> LensEstimate:
     """How much longer the lens is than the given one, if that was a guess."""
-    del config
     stated, camera = inputs.focal_spread, inputs.camera
     spread = UNSTATED if stated is None else max(stated, MEASURED)
     up = camera.R_cam_world[:, 1].double().cpu()

@@ -42,10 +42,9 @@ class ContactProbability:
 
 
 def find_contacts(
-    inputs: ContactInputs, config: ContactConfig, observe: Observer = silent
+    inputs: ContactInputs, config: ContactConfig, _observe: Observer = silent
 ) -> ContactProbability:
     """Contacts by geometry and motion: seat and thighs, back, hands, soles."""
-    del observe
     if config.given and inputs.given is not None:
         return ContactProbability(inputs.given)
     return ContactProbability(touching(inputs.bodies, inputs.parts, inputs.ground))
@@ -116,10 +115,9 @@ class ContactAssignment:
 
 
 def assign_contacts(
-    inputs: AssignInputs, config: AssignConfig, observe: Observer = silent
+    inputs: AssignInputs, config: AssignConfig, _observe: Observer = silent
 ) -> ContactAssignment:
     """Give each touching part of each body to the object that it touches."""
-    del observe
     bodies, objects = inputs.bodies, inputs.objects
     found = [c for c in contact_rows(inputs, config) if len(c.body)]
     seated, counts = torch.zeros(len(bodies.frame), dtype=torch.bool), [0] * len(objects.ids)

@@ -6,7 +6,6 @@ product, with a lower bound on the second, as no posture shows a shin against a 
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -19,7 +18,6 @@ from mover.bodies.posture import touching
 from mover.bodies.skin import PARTS
 from mover.core.observe import Observer, silent
 from mover.core.records import record
-from mover.core.settings import Metres, Share
 from mover.core.types import Bodies, ContactLabels, Mesh
 from mover.geometry.nearest import as_float64, as_int64, closest, enclosed
 from mover.geometry.placement import StandingMesh
@@ -29,17 +27,9 @@ from mover.stages.contacts.assign_contacts import evenly
 FLOOR = "ground"
 NEAR = 0.02  # [m], up to here the part surely touches
 UNSEEN = 0.4  # share of the confidence that nearness alone gives, where no posture supports it
+REACH = 0.06  # [m], from here on nothing touches: what bodies of single frames float on average
+LEAST = 0.2  # labels below this confidence are left out
 MOST = 40  # vertices of a part that are measured, evenly chosen
-
-
-@dataclass(frozen=True)
-class LabelConfig:
-    """What counts as a touch."""
-
-    reach: Metres = 0.06
-    """From here on nothing touches [m]: what bodies of single frames float on average."""
-    least: Share = 0.2
-    """Labels below this confidence are left out."""
 
 
 @record
@@ -66,10 +56,9 @@ class _SurfacePoints:
 
 
 def label_contacts(
-    inputs: LabelInputs, config: LabelConfig, observe: Observer = silent
+    inputs: LabelInputs, _config: None = None, _observe: Observer = silent
 ) -> ContactLabels:
     """The labels of all frames, in the order of parts, objects, rows."""
-    del observe
     bodies = inputs.bodies
     ground = float(bodies.verts[..., 1].amin()) if inputs.ground is None else inputs.ground
     chance = touching(bodies, inputs.parts, ground)
@@ -80,16 +69,16 @@ def label_contacts(
     points = bodies.verts[:, torch.cat(chosen)]
     none, flat = torch.zeros(0, dtype=torch.long), points.new_zeros(0, 3)
     found: list[tuple[Tensor, ...]] = [(none, none, none, flat[:, 0], flat, flat)]
-    for k, surface in _surfaces(points, inputs, config):
+    for k, surface in _surfaces(points, inputs):
         for number in part_of.unique().tolist():
-            row, *touch = _touches(surface, part_of == number, config)
+            row, *touch = _touches(surface, part_of == number)
             found.append((torch.full_like(row, number), torch.full_like(row, k), row, *touch))
     columns = (torch.cat(column) for column in zip(*found, strict=True))
     part, of, row, gap, position, normal = columns
-    close = ((gap - config.reach) / (NEAR - config.reach)).clamp(0, 1)
+    close = ((gap - REACH) / (NEAR - REACH)).clamp(0, 1)
     confidence = close * (UNSEEN + (1 - UNSEEN) * sure[row, part])
     order = part.argsort(stable=True)
-    order = order[confidence[order] >= config.least]
+    order = order[confidence[order] >= LEAST]
     return ContactLabels(
         frame=bodies.frame[row[order]], person=bodies.person[row[order]], part=part[order],
         object=of[order], position=position[order], normal=normal[order], gap=gap[order],
@@ -98,13 +87,13 @@ def label_contacts(
 
 
 def _surfaces(
-    points: Float[Tensor, "bodies verts 3"], inputs: LabelInputs, config: LabelConfig
+    points: Float[Tensor, "bodies verts 3"], inputs: LabelInputs
 ) -> Iterator[tuple[int, _SurfacePoints]]:
     """Each object where it stands, and the floor; one at a time: memory stays that of one."""
     for k, stands in enumerate(inputs.meshes):
         for there in stands:
             now = there.when(inputs.bodies.frame)
-            yield k, _solid(points, there.mesh, now, config.reach)
+            yield k, _solid(points, there.mesh, now)
     if inputs.ground is not None:
         below, up = points.clone(), torch.zeros_like(points)
         below[..., 1], up[..., 1] = inputs.ground, 1.0
@@ -112,11 +101,11 @@ def _surfaces(
 
 
 def _solid(
-    points: Float[Tensor, "bodies verts 3"], mesh: Mesh, now: Bool[Tensor, " bodies"], reach: float
+    points: Float[Tensor, "bodies verts 3"], mesh: Mesh, now: Bool[Tensor, " bodies"]
 ) -> _SurfacePoints:
     verts = as_float64(mesh.verts)
     faces = outward(verts, as_int64(mesh.faces))
-    low, high = mesh.verts.amin(0) - reach, mesh.verts.amax(0) + reach
+    low, high = mesh.verts.amin(0) - REACH, mesh.verts.amax(0) + REACH
     near = (torch.minimum(points - low, high - points).amin(-1) > 0) & now[:, None]
     gap, position = torch.full_like(points[..., 0], torch.inf), torch.zeros_like(points)
     normal = torch.zeros_like(points)
@@ -133,11 +122,11 @@ def _solid(
 
 
 def _touches(
-    surface: _SurfacePoints, part: Bool[Tensor, " verts"], config: LabelConfig
+    surface: _SurfacePoints, part: Bool[Tensor, " verts"]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Bodies whose part is near, its gap, position and normal: means over its nearest points."""
     gap = surface.gap[:, part].amin(1)
-    row = (gap < config.reach).nonzero()[:, 0]
+    row = (gap < REACH).nonzero()[:, 0]
     each, gap, normal = surface.gap[row][:, part], gap[row], surface.normal[row][:, part]
     layer = (each <= gap[:, None].clamp_min(0) + NEAR / 2).to(normal)[..., None]
     share = layer / layer.sum(1, keepdim=True)
