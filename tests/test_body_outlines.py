@@ -11,7 +11,7 @@ from mover.energy.body_terms import OUTLINE_POINTS, Outline, outline_term
 from mover.geometry.camera import project
 from mover.geometry.raster import Crops, layers
 from mover.stages.masks import MaskTable
-from mover.stages.people.body_outlines import SeenBodies, gather_outlines
+from mover.stages.people.body_evidence import SeenBodies, gather_outlines
 from mover_bench.rooms.render import encode
 
 K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])

@@ -10,8 +10,7 @@ from furnished import bodies_of, furnished, write_out
 from little_room import GROUND, box
 
 from mover.app.cli import run_command
-from mover.bodies.parts import members, parts_of
-from mover.bodies.skin import PARTS
+from mover.bodies.parts import PARTS, members, parts_of
 from mover.bodies.skinning import open_body, zero_pose
 from mover.core.errors import InputError
 from mover.core.types import Bodies, ContactLabels, Mesh

@@ -8,8 +8,7 @@ import torch
 from judged import grid_body
 from little_room import GROUND, box, camera, piece
 
-from mover.bodies.parts import BodyParts
-from mover.bodies.skin import LANDMARKS
+from mover.bodies.parts import LANDMARKS, BodyParts
 from mover.core.types import Bodies, Scene, SceneObject, Segment
 from mover.evaluate.contact import StandingMesh, nearness
 from mover.extensions.moved_furniture.movers import Between, Followed, follow_mover

@@ -15,7 +15,7 @@ from mover.bodies.keypoints import LAYOUTS
 from mover.core.errors import InputError
 from mover.core.types import Masks
 from mover.geometry.rle import decode, encode
-from mover.perceive import mediapipe, needs, weights
+from mover.perceive import mediapipe, needs
 from mover.perceive.config import FramesConfig, ModelsConfig
 from mover.perceive.mediapipe import (
     PoseInputs,
@@ -201,20 +201,20 @@ class TestWeights:
     ):
         content = b"\0\0\0\0TFL3" + bytes(9)
         digest = hashlib.sha256(content).hexdigest()
-        wheel = {name: (here, digest) for name, (here, _) in weights.IN_WHEEL.items()}
-        monkeypatch.setattr(weights, "IN_WHEEL", wheel)
+        wheel = {name: (here, digest) for name, (here, _) in needs.IN_WHEEL.items()}
+        monkeypatch.setattr(needs, "IN_WHEEL", wheel)
         source = self.archive(tmp_path / "m.whl", dict.fromkeys(wheel, content))
-        assert weights.networks() is None
+        assert needs.networks() is None
         assert run_command("weights", ["mediapipe", str(source)]) == 0
-        assert weights.networks() is not None
+        assert needs.networks() is not None
         assert capsys.readouterr().out.count("wrote") == 2
         heavy = tmp_path / "heavy.tflite"
         heavy.write_bytes(content + b"1")
-        weights.fetch(print, heavy)
-        bundle = dict.fromkeys(weights.IN_TASK, content + b"2")
+        needs.fetch(print, heavy)
+        bundle = dict.fromkeys(needs.IN_TASK, content + b"2")
         for source, last in ((heavy, b"1"), (self.archive(tmp_path / "h.task", bundle), b"2")):
-            weights.fetch(print, source)
-            assert (weights.folder() / weights.LANDMARKS).read_bytes()[-1:] == last
+            needs.fetch(print, source)
+            assert (needs.folder() / needs.LANDMARKS).read_bytes()[-1:] == last
 
     @pytest.mark.parametrize(
         ("name", "content", "words"),
@@ -230,19 +230,19 @@ class TestWeights:
     ):
         path = tmp_path / name
         if content is None:
-            self.archive(path, dict.fromkeys(weights.IN_WHEEL, b"\0\0\0\0TFL3other"))
+            self.archive(path, dict.fromkeys(needs.IN_WHEEL, b"\0\0\0\0TFL3other"))
         else:
             path.write_bytes(content)
         with pytest.raises(InputError, match=words):
-            weights.fetch(print, path)
+            needs.fetch(print, path)
         with pytest.raises(InputError, match="no such file"):
-            weights.fetch(print, tmp_path / "none.whl")
-        assert weights.networks() is None
+            needs.fetch(print, tmp_path / "none.whl")
+        assert needs.networks() is None
 
     def test_a_download_that_fails_says_what_to_do(self, monkeypatch: pytest.MonkeyPatch):
         monkeypatch.setattr(sys, "executable", "false")
         with pytest.raises(InputError, match=r"mover weights mediapipe FILE\.whl"):
-            weights.fetch(print)
+            needs.fetch(print)
 
     def test_only_what_is_needed_is_asked_for(self, monkeypatch: pytest.MonkeyPatch):
         monkeypatch.setattr(needs.importlib.util, "find_spec", lambda _: None)
@@ -260,12 +260,12 @@ class TestWeights:
 @pytest.mark.slow
 @pytest.mark.skipif(not CLIPS.is_dir(), reason="shared/data is not there")
 @pytest.mark.skipif(find_spec("ai_edge_litert") is None, reason="ai-edge-litert is not installed")
-@pytest.mark.skipif(weights.networks() is None, reason="mover weights mediapipe has not been run")
+@pytest.mark.skipif(needs.networks() is None, reason="mover weights mediapipe has not been run")
 @pytest.mark.parametrize("name", ["s1_ADL_16", "s3_ADL_18", "s4_ADL_19"])
 def test_joints_and_masks_are_those_of_mediapipe(name: str):
     stored = np.load(CLIPS / name / "mediapipe_full.npz")
     wanted, misses, overlaps = stored["frame"].tolist(), list[float](), list[float]()
-    nets = [mediapipe.loaded(str(path)) for path in weights.networks() or ()]
+    nets = [mediapipe.loaded(str(path)) for path in needs.networks() or ()]
     for index, _, pixels in read_frames(CLIPS / name / "video.mp4", FramesConfig()):
         if index not in wanted:
             continue

@@ -7,9 +7,8 @@ import torch
 from analytic import FACES, box_verts
 from figures import ARMS_DOWN, ARMS_UP, SEATED, STRIDE, people, pose, turned
 
-from mover.bodies.parts import members, parts_of
+from mover.bodies.parts import PARTS, members, parts_of
 from mover.bodies.skeleton import BODY
-from mover.bodies.skin import PARTS
 from mover.bodies.skinning import open_body, zero_pose
 from mover.core.types import Bodies
 from mover.geometry.mesh import vertex_normals

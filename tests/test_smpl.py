@@ -8,9 +8,8 @@ from make_keypoints import rest_pose
 from make_smpl import make_model, write_models, write_npz, write_old_pickle
 
 from mover.bodies import BODY_MODELS, BodyModel, load_model
-from mover.bodies.parts import members, parts_of
+from mover.bodies.parts import PARTS, members, parts_of
 from mover.bodies.skeleton import JOINTS, PARENTS
-from mover.bodies.skin import PARTS
 from mover.bodies.skinning import FLAT, vertex_subset
 from mover.bodies.smpl_files import FOLDER, find_file, load_smpl
 from mover.core.errors import InputError

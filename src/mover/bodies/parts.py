@@ -14,18 +14,37 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mover.bodies.skeleton import BODY
-from mover.bodies.skin import LANDMARKS, PARTS, landmark_rings, lowest_soles, model_parts
+from mover.bodies.skeleton import BODY, FINGERS, SIDES
 from mover.bodies.skinning import ASSETS, SkinnedBody, open_body, vertex_subset, zero_pose
 from mover.bodies.smpl_files import KINDS, load_smpl
 from mover.bodies.transfer import solved
 from mover.core.errors import InputError
-from mover.core.records import record
+from mover.core.records import record, to_device
 from mover.core.types import Bodies
 from mover.geometry.mesh import vertex_normals
 from mover.geometry.rotations import rotation_vectors
 
 log = logging.getLogger(__name__)
+PARTS = (
+    "left_sole", "right_sole", "seat", "left_thigh", "right_thigh", "back",
+    "left_palm", "right_palm", "left_forearm", "right_forearm",
+)  # fmt: skip
+"""Patches of skin; of thighs and forearms only the undersides."""
+SOLES = PARTS[:2]
+LANDMARKS = (
+    "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle", "neck",
+    "left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist",
+)  # fmt: skip
+"""Joints that are found on any body."""
+ABOVE = {
+    "hip": "pelvis", "knee": "hip", "ankle": "knee", "neck": "spine3",
+    "shoulder": "collar", "elbow": "shoulder", "wrist": "elbow",
+}  # fmt: skip
+"""The joint whose skin blends with that of each landmark."""
+BLEND = 0.12  # product of the weights of both, at least, around a landmark
+MEMBERS = 24  # vertices of a ring
+HEIGHT = 0.03  # [heights of the mesh] from its lowest point, at most, of a sole of an unknown mesh
+SOLE_HEIGHT = 0.025  # [statures], the same of a skinned body: 4 cm of an adult
 POSES = 4  # rows that show where the soles of an unknown mesh are
 STEPS = 60  # of L-BFGS, of the open body's pose
 SIGMA_JOINT, SIGMA_ANGLE, SIGMA_SHAPE = 0.01, 1.0, 2.0  # [m], [rad] and coefficients
@@ -58,8 +77,7 @@ def parts_of(bodies: Bodies, up_cam: Float[Tensor, "3"] | None = None) -> BodyPa
         up_cam: Direction of up in the frame of `bodies`; a level camera or +y of the world if not
             given. Used only for a mesh of unknown topology without joints: its soles lie lowest.
     """
-    found, device = _find(bodies, up_cam), bodies.verts.device
-    return BodyParts(found.part_of.to(device), found.rings.to(device))
+    return to_device(_find(bodies, up_cam), bodies.verts.device)
 
 
 def _find(bodies: Bodies, up_cam: Float[Tensor, "3"] | None) -> BodyParts:
@@ -155,3 +173,86 @@ def _listed(bodies: Bodies) -> BodyParts | None:
     if bodies.verts.shape[1] != len(part_of) or hashlib.sha256(faces).hexdigest() != digest:
         return None
     return BodyParts(torch.from_numpy(part_of).long(), torch.from_numpy(rings).long())
+
+
+def landmark_rings(model: SkinnedBody) -> Int[Tensor, "landmarks members"]:
+    """Vertices around each of `LANDMARKS`, far from each other: their mean is its middle."""
+    weight = dict(zip(model.joint_names, model.weights.T.numpy(), strict=True))
+    mesh, rows = model.verts.numpy(), list[np.ndarray]()
+    for name in LANDMARKS:
+        side, _, joint = name.rpartition("_")
+        above = weight.get(f"{side}_{ABOVE[joint]}", weight.get(ABOVE[joint]))
+        ring = np.nonzero(above * weight[name] > BLEND)[0]
+        index = ring if len(ring) else np.arange(len(mesh))
+        points = mesh[index]
+        far = np.linalg.norm(points - points.mean(0), axis=1)
+        chosen: list[int] = []
+        for _ in range(MEMBERS):
+            chosen.append(int(far.argmax()))
+            far = np.minimum(far, np.linalg.norm(points - points[chosen[-1]], axis=1))
+        rows.append(index[chosen])
+    return torch.from_numpy(np.stack(rows))
+
+
+def lowest_soles(
+    meshes: Float[Tensor, "meshes verts 3"], faces: Int[Tensor, "faces 3"], up: Float[Tensor, "3"]
+) -> Int[Tensor, " verts"]:
+    """Index into `PARTS` (a sole) or -1 of each vertex: what lies lowest and faces down.
+
+    For meshes of unknown topology without joints; sides by position only.
+    """
+    height = meshes @ up
+    low, high = height.amin(1, keepdim=True), height.amax(1, keepdim=True)
+    near = height < low + HEIGHT * (high - low)
+    down = vertex_normals(meshes, faces) @ up < -0.6
+    sole = (near & down).double().mean(0) >= 0.5
+    part = torch.full((meshes.shape[1],), -1)
+    if sole.any():
+        points = meshes[0, sole] - up * (meshes[0, sole] @ up)[:, None]
+        points = points - (points.amax(0) + points.amin(0)) / 2
+        widest = torch.linalg.eigh(points.T @ points).eigenvectors[:, -1]
+        first, second = PARTS.index("left_sole"), PARTS.index("right_sole")
+        part[sole] = torch.where(points @ widest > 0, first, second)
+    return part
+
+
+def model_parts(model: SkinnedBody) -> Int[Tensor, " verts"]:
+    """Index of each vertex of `model` into `PARTS`, -1 for none; the first of several."""
+    part = torch.full((len(model.verts),), -1, dtype=torch.long, device=model.verts.device)
+    for name, inside in _patches(model).items():
+        part[inside & (part < 0)] = PARTS.index(name)
+    return part
+
+
+def _patches(model: SkinnedBody) -> dict[str, Bool[Tensor, " verts"]]:
+    """Where each part is in the zero pose (T-pose, +y up, +z front)."""
+    verts, joints = (x[0] for x in model.posed(zero_pose(1, model)))
+    dominant = [model.joint_names[j] for j in model.weights.argmax(1).tolist()]
+    place = dict(zip(model.joint_names, joints, strict=True))
+    _, ny, nz = vertex_normals(verts, model.faces).unbind(-1)
+
+    def of(*joints: str) -> Bool[Tensor, " verts"]:
+        known = frozenset(joints)
+        return torch.tensor([name in known for name in dominant], device=verts.device)
+
+    height = verts[:, 1]
+    low, stature = height.min(), height.max() - height.min()
+    hip = (place["left_hip"][1] + place["right_hip"][1]) / 2
+    thigh = hip - (place["left_knee"][1] + place["right_knee"][1]) / 2
+    patches: dict[str, Bool[Tensor, " verts"]] = {}
+    for side in SIDES:
+        near_floor = height < low + SOLE_HEIGHT * stature
+        patches[f"{side}_sole"] = of(f"{side}_ankle", f"{side}_foot") & (ny < -0.6) & near_floor
+    trunk = of("pelvis", "spine1", "left_hip", "right_hip")
+    level = (height > hip - 0.34 * thigh) & (height < hip + 0.24 * thigh)
+    behind = verts[:, 2] < (place["left_hip"][2] + place["right_hip"][2]) / 2
+    patches["seat"] = trunk & level & behind & (nz < 0.3)
+    for side in SIDES:
+        patches[f"{side}_thigh"] = of(f"{side}_hip") & (nz < -0.2)
+    spine = of("pelvis", "spine1", "spine2", "spine3", "left_collar", "right_collar")
+    patches["back"] = spine & (nz < -0.45) & (height > hip)
+    for side in SIDES:
+        fingers = [f"{side}_{f}{k}" for f in FINGERS for k in (1, 2, 3)]
+        patches[f"{side}_palm"] = of(f"{side}_wrist", f"{side}_hand", *fingers) & (ny < -0.3)
+        patches[f"{side}_forearm"] = of(f"{side}_elbow") & (ny < -0.3)
+    return patches

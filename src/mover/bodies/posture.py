@@ -10,9 +10,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mover.bodies.parts import BodyParts, members
+from mover.bodies.parts import LANDMARKS, SOLES, BodyParts, members
 from mover.bodies.skeleton import SIDES
-from mover.bodies.skin import LANDMARKS, SOLES
 from mover.core.records import record
 from mover.core.types import Bodies, rows_by_person
 from mover.geometry.mesh import vertex_normals

@@ -7,9 +7,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mover.bodies.parts import members, parts_of
+from mover.bodies.parts import SOLES, members, parts_of
 from mover.bodies.skeleton import BODY
-from mover.bodies.skin import SOLES
 from mover.core.records import record
 from mover.core.types import Bodies, Camera
 from mover.evaluate.scene import Metric

@@ -13,8 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mover.bodies.corrected import in_world
-from mover.bodies.parts import members, parts_of
-from mover.bodies.skin import SOLES
+from mover.bodies.parts import SOLES, members, parts_of
 from mover.core.records import record
 from mover.core.run import Run
 from mover.core.settings import Count, Metres, int_in

@@ -31,8 +31,7 @@ from mover.core.records import record
 from mover.core.types import Keypoints, Masks
 from mover.geometry.rle import decode, encode
 from mover.io.people.found import followed
-from mover.perceive import weights
-from mover.perceive.needs import install
+from mover.perceive.needs import COMMAND, install, networks
 from mover.perceive.reference import Clean
 from mover.perceive.video import Clip, read_picture
 
@@ -83,9 +82,9 @@ def pose_inputs(clip: Clip) -> PoseInputs:
     Raises:
         InputError: If they are not there.
     """
-    found = weights.networks()
+    found = networks()
     if found is None:
-        raise InputError(f"MediaPipe's networks are not here: {weights.COMMAND}")
+        raise InputError(f"MediaPipe's networks are not here: {COMMAND}")
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in found)).hexdigest()
     return PoseInputs(clip, (str(found[0]), str(found[1])), digest)
 

@@ -136,7 +136,7 @@ class WeightsArgs:
 
 def bring_weights(arguments: Sequence[str]) -> None:
     """`mover weights`."""
-    from mover.perceive.weights import fetch
+    from mover.perceive.needs import fetch
 
     args = tyro.cli(WeightsArgs, prog="mover weights", args=list(arguments))
     fetch(say, args.file)

@@ -10,10 +10,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mover.bodies.parts import BodyParts, members
+from mover.bodies.parts import SOLES, BodyParts, members
 from mover.bodies.posture import at, landmarks
 from mover.bodies.skeleton import SIDES
-from mover.bodies.skin import SOLES
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
 from mover.core.types import Bodies, Camera, rows_by_person

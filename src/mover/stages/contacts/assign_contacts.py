@@ -11,9 +11,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from mover.bodies.parts import BodyParts
+from mover.bodies.parts import PARTS, BodyParts
 from mover.bodies.posture import at, elevation, headings, landmarks, postures, touching
-from mover.bodies.skin import PARTS
 from mover.core.observe import Observer, silent
 from mover.core.records import record
 from mover.core.types import Bodies

@@ -13,9 +13,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from mover.bodies.parts import BodyParts, members
+from mover.bodies.parts import PARTS, BodyParts, members
 from mover.bodies.posture import touching
-from mover.bodies.skin import PARTS
 from mover.core.observe import Observer, silent
 from mover.core.records import record
 from mover.core.types import Bodies, ContactLabels, Mesh

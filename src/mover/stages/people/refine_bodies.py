@@ -22,10 +22,9 @@ from mover.bodies.corrected import (
     normals_after,
     puppet_of,
 )
-from mover.bodies.parts import parts_of
+from mover.bodies.parts import PARTS, parts_of
 from mover.bodies.posture import postures, touching
 from mover.bodies.skeleton import SIDES
-from mover.bodies.skin import PARTS
 from mover.core.errors import InputError
 from mover.core.observe import Energy, Observer, silent
 from mover.core.records import map_tensors, record, rows_of, with_rows
@@ -50,13 +49,14 @@ from mover.stages.config import RefineBodiesConfig
 from mover.stages.masks import MaskTable, mask_table
 from mover.stages.people.body_evidence import (
     Picked,
+    SeenBodies,
     Surroundings,
+    gather_outlines,
     order_bounds,
     pick,
     resting_soles,
     surroundings_of,
 )
-from mover.stages.people.body_outlines import SeenBodies, gather_outlines
 from mover.stages.people.plant_feet import plant_feet
 
 RHOS = (0.15, 0.06)  # [m], where a contact costs half of the most, in the first and last round
