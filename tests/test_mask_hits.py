@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mover.stages.contacts.contact_association import Candidates, decide_by_mask_hits
+from mover.stages.contacts.assign_contacts import Candidates, decide_by_mask_hits
 
 H, W = 40, 60
 

@@ -31,14 +31,15 @@ from mover.io.files.meshes import write_mesh
 from mover.io.formats import read
 from mover.perceive.capture import read_picture_of, write_first_scene
 from mover.perceive.config import LayoutConfig, ScreenConfig
-from mover.perceive.depth_map import floor_height, median_depths
 from mover.perceive.layout import (
     SOUGHT,
     FirstScene,
     Picture,
     at_scale,
     first_scene,
+    floor_height,
     is_placed,
+    median_depths,
     shapes_of,
 )
 from mover.perceive.screen import ScreenInputs, outermost, screen

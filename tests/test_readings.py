@@ -22,7 +22,7 @@ from mover.geometry.placement import place, rest_on_support
 from mover.pipeline.presets import PRESETS, READINGS, literally
 from mover.stages.camera.align_camera import AlignInputs, align_camera
 from mover.stages.config import AlignConfig, AssignConfig, GatherConfig, PlaceConfig
-from mover.stages.contacts.contact_association import AssignInputs, contact_rows
+from mover.stages.contacts.assign_contacts import AssignInputs, contact_rows
 from mover.stages.contacts.gather_cues import GatherInputs, depth_bounds
 from mover.stages.objects.place_objects import energy_of
 from mover.stages.objects.prepare_objects import find_regions

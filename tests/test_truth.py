@@ -19,8 +19,7 @@ from mover.io.capture.scene_file import write_scene
 from mover.pipeline import objects as steps
 from mover.pipeline.people import estimate_people
 from mover.pipeline.presets import PRESETS
-from mover.stages.contacts.assign_contacts import LONG, assign_contacts
-from mover.stages.contacts.contact_association import AssignInputs
+from mover.stages.contacts.assign_contacts import LONG, AssignInputs, assign_contacts
 from mover.stages.contacts.gather_cues import cues_in_windows
 from mover.stages.objects.find_image_cues import ImageInputs, find_image_cues, image_evidence
 from mover.stages.objects.place_inputs import Placed, PlaceInputs

@@ -23,12 +23,12 @@ from mover.stages.camera.refine_camera import RefineInputs, refine_camera
 from mover.stages.camera.room_lines import Segments
 from mover.stages.config import PlaceConfig
 from mover.stages.contacts.assign_contacts import (
+    AssignInputs,
     ContactAssignment,
     ContactInputs,
     assign_contacts,
     find_contacts,
 )
-from mover.stages.contacts.contact_association import AssignInputs
 from mover.stages.contacts.gather_cues import Cues, GatherInputs, cues_in_windows, gather_cues
 from mover.stages.objects.find_image_cues import (
     ImageInputs,

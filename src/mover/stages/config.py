@@ -212,7 +212,7 @@ class AssignConfig:
     """How contact vertices find their objects."""
 
     by: Literal["mask_hits", "group", "vertex"] = "mask_hits"
-    """By the rules of the authors' released code, by groups of parts (`contact_association`), or
+    """By the rules of the authors' released code, by groups of parts (`assign_contacts`), or
     each vertex by itself (preset `printed`)."""
     cell: Annotated[float, float_in(1e-4, 10)] = 0.01
     """Contact points nearer than this become one with their count as weight [m]."""
