@@ -18,7 +18,7 @@ from torch import Tensor
 
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
-from mover.core.types import Bodies, Camera, Capture, Heading, SceneObject, Tilt
+from mover.core.types import Camera, Capture, Heading, SceneObject, Tilt
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import pitch_roll, tilted
 from mover.geometry.rotations import wrap
@@ -147,17 +147,14 @@ def through_lens(capture: Capture, zoom: float, pinned: tuple[str, ...] = ()) ->
     """
     if zoom == 1:
         return capture
-    camera = capture.scene.camera
-    scene = dataclasses.replace(
-        capture.scene,
-        camera=zoomed(camera, zoom),
-        objects=tuple(
-            piece if piece.id in pinned else _deeper(piece, camera, zoom)
-            for piece in capture.scene.objects
-        ),
-    )
+    scene, camera, bodies = capture.scene, capture.scene.camera, capture.bodies
+    objects = tuple(p if p.id in pinned else _deeper(p, camera, zoom) for p in scene.objects)
+    scene = dataclasses.replace(scene, camera=zoomed(camera, zoom), objects=objects)
     others = tuple(_deeper(piece, camera, zoom) for piece in capture.hypotheses)
-    bodies = None if capture.bodies is None else _people_deeper(capture.bodies, zoom)
+    if bodies is not None:
+        gap = torch.zeros_like(bodies.verts[:, 0])
+        gap[:, 2] = (zoom - 1) * pelvis(bodies)[:, 2]
+        bodies = shifted(bodies, gap)
     return dataclasses.replace(capture, scene=scene, hypotheses=others, bodies=bodies)
 
 
@@ -166,13 +163,6 @@ def _deeper(piece: SceneObject, camera: Camera, zoom: float) -> SceneObject:
     away = R[2] @ box_of(piece).center.double()
     t = piece.t_world_object.double() + (zoom - 1) * away * R[2]
     return dataclasses.replace(piece, t_world_object=t.to(piece.t_world_object))
-
-
-def _people_deeper(bodies: Bodies, zoom: float) -> Bodies:
-    away: Float[Tensor, " bodies"] = pelvis(bodies)[:, 2]
-    gap = torch.zeros_like(bodies.verts[:, 0])
-    gap[:, 2] = (zoom - 1) * away
-    return shifted(bodies, gap)
 
 
 def zoomed(camera: Camera, zoom: float) -> Camera:

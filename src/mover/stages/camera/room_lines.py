@@ -229,7 +229,9 @@ def _descend(segments: Segments, prior: Prior, pose: RoomPose, coarse: float) ->
     cost, gradient, hessian = _quadratic(segments, prior, pose, coarse)
     for _ in range(STEPS):
         damped = hessian + damping[:, None, None] * torch.diag_embed(hessian.diagonal(0, 1, 2))
-        new = _moved(pose, -torch.linalg.solve(damped, gradient))
+        step = -torch.linalg.solve(damped, gradient)
+        turned = axis_angle(step[:, 1:4]) @ pose.R_cam_room
+        new = RoomPose(pose.log_focal + step[:, 0], turned, pose.askew + step[:, 4:])
         after = _quadratic(segments, prior, new, coarse)
         better = after[0] < cost
         damping = torch.where(better, damping / 5, damping * 5)
@@ -242,12 +244,6 @@ def _descend(segments: Segments, prior: Prior, pose: RoomPose, coarse: float) ->
         gradient = torch.where(better[:, None], after[1], gradient)
         hessian = torch.where(better[:, None, None], after[2], hessian)
     return pose
-
-
-def _moved(pose: RoomPose, step: Float[Tensor, "starts unknowns"]) -> RoomPose:
-    """The cameras after a step."""
-    R = axis_angle(step[:, 1:4]) @ pose.R_cam_room
-    return RoomPose(pose.log_focal + step[:, 0], R, pose.askew + step[:, 4:])
 
 
 def _likelihood(

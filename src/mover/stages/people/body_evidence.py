@@ -304,18 +304,18 @@ def _compare(
     others: Bool[Tensor, "h w"],
 ) -> Outline | None:
     """The outline of one body; None where too little of it can be compared."""
-    body, zoom = drawn.isfinite(), float(window[2])
-    own, others = (_sampled(m, window, seen.camera) for m in (own, others))
+    body, zoom, camera = drawn.isfinite(), float(window[2]), seen.camera
+    x, y = ((torch.arange(SIDE) + 0.5) / zoom + float(c) for c in window[:2])  # [px of the image]
+    own, others, front = (_sampled(m, x, y, camera) for m in (own, others, seen.front))
     if not bool(own.any()) or not bool(body.any()):
         return None
     depth = drawn[body].median()
-    front = _sampled(seen.front, window, seen.camera)
-    outside = _outside(window, seen.camera)
-    blocked = widened((others | (front < depth + BEHIND) | outside)[None], SPREAD)[0]
+    border = (x < 2) | (x > camera.width - 2) | ((y < 2) | (y > camera.height - 2))[:, None]
+    blocked = widened((others | (front < depth + BEHIND) | border)[None], SPREAD)[0]
     away = _signed(own)
     normal, rises = _slope(_signed(body)), _slope(away)
     agree = (normal * rises).sum(0) > ALONG
-    near = away.abs() < REACH * seen.camera.width * zoom
+    near = away.abs() < REACH * camera.width * zoom
     edge = body & widened(~body[None], 1)[0]
     y, x = (edge & ~blocked & agree & near).nonzero(as_tuple=True)
     if len(y) < LEAST:
@@ -353,20 +353,14 @@ def _wider(
     return share[0].to(gap) * WIDER
 
 
-def _sampled(image: Tensor, window: Float[Tensor, "3"], camera: Camera) -> Tensor:
-    """An image of any size at the pixel centres of the window; its border goes on."""
-    x, y = ((torch.arange(SIDE) + 0.5) / float(window[2]) + float(c) for c in window[:2])
+def _sampled(
+    image: Tensor, x: Float[Tensor, " side"], y: Float[Tensor, " side"], camera: Camera
+) -> Tensor:
+    """An image of any size at the pixel centres of a window; its border goes on."""
     height, width = image.shape
     columns = (x * width / camera.width).long().clamp(0, width - 1)
     rows = (y * height / camera.height).long().clamp(0, height - 1)
     return image[rows][:, columns]
-
-
-def _outside(window: Float[Tensor, "3"], camera: Camera) -> Bool[Tensor, "side side"]:
-    """Beyond the border of the image, or right at it."""
-    x, y = ((torch.arange(SIDE) + 0.5) / float(window[2]) + float(c) for c in window[:2])
-    rows, columns = (y < 2) | (y > camera.height - 2), (x < 2) | (x > camera.width - 2)
-    return rows[:, None] | columns[None]
 
 
 def _signed(mask: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
