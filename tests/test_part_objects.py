@@ -20,10 +20,9 @@ WEIGHT = 0.3
 
 def start():
     inputs = make_inputs()
-    at = Layout(*(x[0] for x in vars(inputs.starts).values()))
     boxes = (Mesh(verts, FACES) for verts in inputs.objects.verts)
     samples = torch.stack([sample_surface(box, 300)[0] for box in boxes])
-    return replace(inputs.objects, samples=samples), at
+    return replace(inputs.objects, samples=samples), inputs.starts[0]
 
 
 def overlap(objects, at):
@@ -104,15 +103,14 @@ def table_and_chair(away, seat=0.45):
     """A table, a chair before it whose back is `away` from its edge, and a cabinet elsewhere."""
     objects, at = start()
     meshes = [mesh_of(TABLE), mesh_of(chair(seat)), mesh_of((((0.4, 1.8, 0.9), (0.0, 0.0, 0.0)),))]
-    most_verts = max(len(m.verts) for m in meshes)
-    most_faces = max(len(m.faces) for m in meshes)
-    verts = [torch.cat([m.verts, m.verts[:1].expand(most_verts - len(m.verts), 3)]) for m in meshes]
-    faces = [torch.cat([m.faces, m.faces.new_zeros(most_faces - len(m.faces), 3)]) for m in meshes]
-    real = torch.stack([torch.arange(most_verts) < len(m.verts) for m in meshes])
-    samples = torch.stack([sample_surface(m, 400)[0] for m in meshes])
+    count, many = max(len(m.verts) for m in meshes), max(len(m.faces) for m in meshes)
+    pad = torch.nn.functional.pad
     packed = replace(
-        objects, verts=torch.stack(verts), faces=torch.stack(faces), real_verts=real,
-        samples=samples, size=torch.stack([m.verts.amax(0) - m.verts.amin(0) for m in meshes]),
+        objects, faces=torch.stack([pad(m.faces, (0, 0, 0, many - len(m.faces))) for m in meshes]),
+        verts=torch.stack([m.verts[torch.arange(count) % len(m.verts)] for m in meshes]),
+        real_verts=torch.stack([torch.arange(count) < len(m.verts) for m in meshes]),
+        samples=torch.stack([sample_surface(m, 400)[0] for m in meshes]),
+        size=torch.stack([m.verts.amax(0) - m.verts.amin(0) for m in meshes]),
     )  # fmt: skip
     t = torch.tensor([[0.0, -1.4, -3.0], [0.1, -1.4, -3.0], [1.7, -1.4, -4.6]])
     t[1, 2] = -3.0 + 0.4 + away + 0.21  # the chair's front looks away from the table
@@ -223,14 +221,11 @@ def test_the_gradient_leads_the_short_way_out_and_not_up():
 
 
 def test_the_cost_is_that_of_a_naive_loop_over_points_and_boxes():
-    inputs = make_inputs()
-    at = Layout(*(x[0] for x in vars(inputs.starts).values()))
+    objects, at = start()
     t = at.t_world_object.clone()
     t[1] = t[0] + torch.tensor([0.3, 0.0, 0.1])
     scale = torch.tensor([0.1, 0.0, 0.1])
     at = replace(at, t_world_object=t, log_scale=at.log_scale + scale)
-    boxes = [sample_surface(Mesh(v, FACES), 300)[0] for v in inputs.objects.verts]
-    objects = replace(inputs.objects, samples=torch.stack(boxes))
     found = sharing(objects, at)(at)
     expected = torch.tensor([naive(objects, at, i, 1 - i) for i in range(2)] + [0.0])
     assert float(expected.max()) > 1

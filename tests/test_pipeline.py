@@ -11,16 +11,22 @@ import pytest
 import raycast
 import torch
 
-from mover.app.results import read_config, write_results
+from mover.app.results import read_config, write_results, write_truth
 from mover.core import records
 from mover.core.observe import Step, silent
 from mover.core.run import Run
+from mover.geometry.boxes import iou2d
+from mover.geometry.camera import pitch_roll, project, to_camera
+from mover.geometry.placement import place_object
 from mover.geometry.rle import decode
+from mover.io.capture.folder import write_capture
 from mover.io.capture.scene_file import read_scene
 from mover.io.formats import read
 from mover.pipeline.presets import PRESETS
 from mover.pipeline.reconstruct import reconstruct
 from mover.stages.objects.place_inputs import Placed
+from mover_bench.rooms.config import NoiseConfig
+from mover_bench.rooms.noise import add_noise
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 PHOTO, TOTAL3D = SHARED / "photo_bench", SHARED / "total3d_1"
@@ -45,11 +51,6 @@ def light(name, steps=15):
 
 @pytest.fixture(scope="module")
 def capture_folder(tmp_path_factory, small_room):
-    from mover.app.results import write_truth
-    from mover.io.capture.folder import write_capture
-    from mover_bench.rooms.config import NoiseConfig
-    from mover_bench.rooms.noise import add_noise
-
     folder = tmp_path_factory.mktemp("capture")
     write_capture(add_noise(small_room, NoiseConfig(), 1), folder)
     write_truth(small_room.truth, small_room.bodies, folder / "truth")
@@ -127,8 +128,6 @@ class TestRun:
         assert read_config(folder / "run.json") == config
 
     def test_objects_of_the_result_stand_on_the_ground(self, whole):
-        from mover.geometry.placement import place_object
-
         _, room = whole("robust")
         for piece in room.scene.objects:
             lowest = float(place_object(piece).verts[:, 1].min())
@@ -177,12 +176,9 @@ class TestRun:
     def test_two_people_are_two_tracks(self, capture_folder, tmp_path):
         capture = read("folder", capture_folder)
         bodies, people = capture.bodies, capture.people
-        half = bodies.frame > int(bodies.frame.median())
-        both = replace(
-            capture,
-            bodies=replace(bodies, person=half.long(), pose=None),
-            people=replace(people, person=(people.frame > int(bodies.frame.median())).long()),
-        )
+        half, seen = (x.frame > int(bodies.frame.median()) for x in (bodies, people))
+        bodies = replace(bodies, person=half.long(), pose=None)
+        both = replace(capture, bodies=bodies, people=replace(people, person=seen.long()))
         room = run_in(tmp_path, both, light("robust"))
         assert set(room.bodies.person.tolist()) == {0, 1}
 
@@ -190,9 +186,6 @@ class TestRun:
 @pytest.mark.slow
 @pytest.mark.skipif(not PHOTO.exists(), reason="the photograph is not here")
 def test_the_bench_of_a_real_photograph_stands_where_the_soles_stand(tmp_path):
-    from mover.geometry.camera import pitch_roll, to_camera
-    from mover.geometry.placement import place_object
-
     capture = read("folder", PHOTO)
     room = run_in(tmp_path, capture, PRESETS["robust"])
     ground, camera = room.scene.ground, room.scene.camera
@@ -213,10 +206,6 @@ def test_the_bench_of_a_real_photograph_stands_where_the_soles_stand(tmp_path):
 @pytest.mark.slow
 @pytest.mark.skipif(not TOTAL3D.exists(), reason="Total3D's outputs are not here")
 def test_the_outputs_of_a_network_run_through_the_image_only_stage(tmp_path):
-    from mover.geometry.boxes import iou2d
-    from mover.geometry.camera import project, to_camera
-    from mover.geometry.placement import place_object
-
     capture = read("total3d", TOTAL3D)
     config = replace(
         PRESETS["robust"], layout=replace(PRESETS["robust"].layout, yaws=1, num_hypotheses=1)

@@ -13,16 +13,9 @@ from hypothesis import strategies as st
 
 from mover.core.types import Layout
 from mover.energy.config import SceneWeights
-from mover.energy.human_terms import (
-    DepthRange,
-    contact_distance,
-    contact_term,
-    depth_term,
-    shares_of,
-)
 from mover.geometry.camera import project, to_camera
 from mover.geometry.placement import place, rest_on_support
-from mover.geometry.raster import Depths, Topology, look
+from mover.geometry.raster import Topology, look
 from mover.stages.config import PlaceConfig
 from mover.stages.objects.place_inputs import with_walls
 from mover.stages.objects.place_objects import energy_of
@@ -51,14 +44,6 @@ class TestEveryTerm:
         inputs = make_inputs(size=32)
         layout = moved(inputs.starts, seed, 0.3)
         assert (energy(inputs, layout, term, form).per_item >= -1e-6).all()
-
-    def test_starts_are_independent(self, term, form):
-        inputs = make_inputs(size=48)
-        many = [moved(inputs.starts, s, 0.15) for s in range(3)]
-        batch = Layout.cat(*many)
-        one = torch.cat([energy(inputs, m, term, form).per_item for m in many])
-        together = energy(inputs, batch, term, form).per_item
-        torch.testing.assert_close(together, one, rtol=1e-4, atol=1e-5)
 
     def test_gradient_equals_finite_differences(self, term, form):
         """Silhouettes of exact contours are piecewise smooth: they have their own test."""
@@ -161,48 +146,6 @@ class TestPaperAsPrinted:
             assert found == pytest.approx(want, rel=1e-9)
             total += want
         assert total > 0
-
-
-class TestPrintedTerms:
-    """What the printed formulas leave open, see 'Readings of the paper' in docs/method.md."""
-
-    def test_contact_does_not_grow_with_the_number_of_points(self):
-        inputs = make_inputs(torch.float64, size=16)
-        touches = inputs.humans.touches
-        away = replace(inputs.starts, t_world_object=inputs.starts.t_world_object + 0.3)
-        twice = replace(
-            touches,
-            points=torch.cat([touches.points, touches.points], 2),
-            weight=torch.cat([touches.weight, touches.weight], 2),
-        )
-        assert torch.equal(shares_of(twice.weight), touches.share)
-        one, other = (
-            contact_term(contact_distance(away, inputs.objects, some), some, 3, "paper")
-            for some in (touches, twice)
-        )
-        torch.testing.assert_close(one, other)
-        assert one.max() > 0
-
-    def test_what_few_vertices_touch_weighs_little_beside_what_many_touch(self):
-        inputs = make_inputs(torch.float64, size=16)
-        touches = inputs.humans.touches
-        weight = touches.weight.clone()
-        weight[1] *= 0.01
-        away = replace(inputs.starts, t_world_object=inputs.starts.t_world_object + 0.3)
-        few = replace(touches, weight=weight, share=shares_of(weight))
-        distance = contact_distance(away, inputs.objects, touches)
-        both, one = (contact_term(distance, t, 3, "paper")[0] for t in (touches, few))
-        assert float(one[1]) == pytest.approx(2 / 101 * float(both[1]))
-        assert float(one[0]) == pytest.approx(200 / 101 * float(both[0]))
-
-    def test_bounds_that_contradict_each_other_are_no_range(self):
-        covered, four = torch.ones(1, 1, 1, 4, dtype=torch.bool), torch.ones(1, 1, 4)
-        seen = Depths(4.0 * four[None], 4.0 * four[None], covered)
-        near = torch.tensor([[[9.0, 9.0, 4.5, -torch.inf]]])
-        far = torch.tensor([[[1.0, torch.inf, 4.2, 3.0]]])
-        allowed = DepthRange(near, far, torch.ones(1))
-        found = float(depth_term(seen, four, allowed, "paper"))
-        assert found == pytest.approx(5 + 1)
 
 
 @pytest.mark.parametrize(("form", "share"), [("paper", 1.0), ("robust", 0.1)])
