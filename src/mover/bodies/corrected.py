@@ -138,14 +138,10 @@ def corrected(bodies: Bodies, by: Correction) -> Bodies:
 
 
 def larger(bodies: Bodies, factor: Float[Tensor, " bodies"]) -> Bodies:
-    """Bodies as if the whole room were larger: all that the camera sees of it is the same.
+    """Bodies in camera axes as if the whole room were larger: the camera sees the same.
 
     With parameters their shapes grow, as people of that height are; where these cannot, since the
     model is not there or has no shapes, bodies become meshes.
-
-    Args:
-        bodies: In camera axes.
-        factor: Of heights and of the pelvis' place.
     """
     wide = factor.to(bodies.verts)[:, None, None]
     joints = None if bodies.joints is None else wide * bodies.joints

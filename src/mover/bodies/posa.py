@@ -193,13 +193,9 @@ def load_posa(weights: Path, meshes: Path) -> Posa:
 def posa_contacts(
     posa: Posa, bodies: Bodies, samples: int = 0, seed: int = 0
 ) -> Float[Tensor, "bodies verts"]:
-    """Chance that each vertex touches something, in [0, 1].
+    """Chance that each vertex of SMPL-X bodies in the world (+y up) touches something.
 
-    Args:
-        posa: The network.
-        bodies: SMPL-X bodies with their pose, in the world (+y up).
-        samples: Mean over so many random latent codes; 0: the mean code alone.
-        seed: Of the random codes.
+    It is the mean over so many random latent codes; with 0 `samples` of the mean code alone.
 
     Raises:
         InputError: If these are no SMPL-X bodies with a pose.

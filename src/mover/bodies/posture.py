@@ -212,13 +212,7 @@ def _flat(
     chance: Float[Tensor, "bodies verts"],
     layer: tuple[float, float],
 ) -> Float[Tensor, "bodies verts"]:
-    """Leave only what lies in the layer that reaches farthest: furniture is flatter than bodies.
-
-    Args:
-        reach: How far each vertex reaches towards the surface [m].
-        chance: Which vertices could touch.
-        layer: Distances from the farthest at which they do not, and surely do [m].
-    """
+    """Leave only the layer [m] that reaches farthest [m]: furniture is flatter than bodies."""
     could = torch.where(chance > 0.5, reach, torch.full_like(reach, -torch.inf))
     farthest = could.topk(min(5, could.shape[1]), dim=1).values[:, -1:]
     return chance * _ramp(farthest - reach, *layer)

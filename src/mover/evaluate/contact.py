@@ -104,14 +104,9 @@ def gather_truth(
 def gather_touch(
     bodies: Bodies, furniture: Furniture, truth: TrueTouch | None, count: int, reach: float
 ) -> Touch:
-    """Bodies beside the furniture of their scene: `count` of them, and those the truth knows.
+    """Bodies beside the furniture of their scene, in one world: at most `count`, spread evenly.
 
-    Args:
-        bodies: People in the world of their scene.
-        furniture: The closed objects of the same scene.
-        truth: The truth's side of it.
-        count: At most so many bodies, spread evenly over the rows.
-        reach: A vertex touches what is at most so far away [m].
+    Those that the truth knows are measured as well. Within `reach` [m] a vertex touches.
     """
     picked = evenly(len(bodies.frame), count)
     near = nearness(bodies.verts[picked], bodies.frame[picked], furniture, reach)
@@ -132,13 +127,9 @@ def nearness(
     furniture: Furniture,
     reach: float,
 ) -> Nearness:
-    """Distances of body vertices to closed meshes in the same world, exact up to `reach` [m].
+    """Distances of body vertices [m] to closed meshes, exact up to `reach` [m] from their boxes.
 
-    Args:
-        verts: Body vertices [m].
-        frame: Of each body: furniture that is moved is measured where it then stands.
-        furniture: Closed meshes, wound outwards.
-        reach: Vertices farther than this from an object's box are not measured against it [m].
+    Furniture that is moved is measured where it stands in the frame of each body.
     """
     points, per = verts.reshape(-1, 3), verts.shape[1]
     signed = torch.full_like(points[:, 0], torch.inf)

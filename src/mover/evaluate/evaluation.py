@@ -186,11 +186,7 @@ def evaluate_folder(
 ) -> dict[str, Any]:
     """Measure the result folder `out` against the folder `truth` and write out/metrics.json.
 
-    Args:
-        out: The result; its convex parts are kept in out/stages.
-        truth: The true scene.
-        config: Densities and thresholds.
-        physics: Whether both scenes are simulated as well, for the share that is stable.
+    With `physics` both scenes are simulated as well; their convex parts are kept in out/stages.
     """
     initial_people, people, true_people = mapped(
         lambda path: read_bodies(path) if path.exists() else None,
@@ -217,12 +213,7 @@ def read_truth(folder: Path) -> Scene:
 
 
 def table(metrics: Mapping[str, Any], shown: Sequence[str] | None = None) -> str:
-    """The metrics before and after as plain text, then each object.
-
-    Args:
-        metrics: What metrics.json holds.
-        shown: Names of metrics; None: all.
-    """
+    """The metrics before and after as plain text, all or those `shown`, then each object."""
     initial, result = metrics["initial"], metrics["result"]
     lines = [f"{'metric':34}{'before':>10}{'after':>10}{'best':>8}"]
     for name, metric in (METRICS | PHYSICS_METRICS).items():
@@ -247,13 +238,9 @@ def table(metrics: Mapping[str, Any], shown: Sequence[str] | None = None) -> str
 def evaluate_people(
     bodies: Bodies, floor: float | None, furniture: Furniture, truth: Bodies | None = None
 ) -> dict[str, float]:
-    """How people fit floor and furniture, and how far they are from the truth.
+    """How people of a room fit its floor [m] and closed furniture, and how wrong they are.
 
-    Args:
-        bodies: People in the world of their room.
-        floor: Its height in that room [m]; None: not known.
-        furniture: Its closed objects where they stand, and when.
-        truth: The true people in the world of the true room; None: not known.
+    Floor and truth (people in the world of the true room) may not be known.
     """
     soles = members(parts_of(bodies), *SOLES)
     feet = bodies.verts[:, soles] if bool(soles.any()) else None

@@ -52,10 +52,7 @@ def lacking() -> str | None:
 def settle(scene: Scene, run: Run, seconds: float = SECONDS) -> tuple[Settled, ...]:
     """Simulate a scene and compare where its objects end with where they were.
 
-    Args:
-        scene: Initial, result or truth; without a floor, its lowest point is on one.
-        run: Its folder keeps the convex parts.
-        seconds: How long gravity acts.
+    Without a floor its lowest point is on one. The run's folder keeps the convex parts.
 
     Raises:
         InputError: If mujoco is not installed.

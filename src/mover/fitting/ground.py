@@ -120,11 +120,8 @@ def distances_of_lying_people(
 ) -> Float[Tensor, " bodies"]:
     """Logarithm of the distance along the view before and after lying, by time; NaN: free [m].
 
-    Args:
-        joints: Of the body, in camera axes [m].
-        up: About upright.
-        tracks: Rows of each person, in the order of time.
-        time: Of each row [s].
+    Joints of the body are in camera axes [m], `up` is about upright; `tracks` are the rows of each
+    person in the order of time [s].
     """
     trunk = trunk_of(joints)
     view = torch.nn.functional.normalize(joints[:, 0], dim=-1)

@@ -38,13 +38,9 @@ def noise_of(
 ) -> Float[Tensor, " bodies"]:
     """Noise of the keypoints of each body's person along each axis [px]; 0: not known.
 
-    From the median, so that joints which are swapped or guessed at the wrong place do not count.
-
-    Args:
-        off: Keypoints from their projections by a fit [px].
-        seen: Which of them there are.
-        person: Whose body it is.
-        left: Share of the variance of the noise that a fit leaves.
+    From the median of how far they are `off` their projections by a fit [px], so that joints which
+    are swapped or guessed at the wrong place do not count. A fit leaves the share `left` of the
+    variance of the noise.
     """
     noise, there = off.new_zeros(len(off)), seen.weight > 0
     for one in person.unique():
@@ -74,13 +70,9 @@ def bias_of(
     person: Int[Tensor, " bodies"],
     share: Float[Tensor, " bodies"],
 ) -> Bias:
-    """What changed in bodies that were seen and fitted again, with noise.
+    """What changed in the bodies `found` that were seen and fitted `again`, with noise.
 
-    Args:
-        found: The bodies that were seen.
-        again: What was fitted to them.
-        person: Row of the shapes of each.
-        share: Of the variance of that noise, what is really in keypoints.
+    `share` is how much of the variance of that noise is really in the keypoints.
     """
     count = torch.bincount(person, minlength=len(found.betas)).to(found.place)
     moved = again.place[:, 2] - found.place[:, 2]

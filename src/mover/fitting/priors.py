@@ -80,12 +80,9 @@ def resting(bodies: int, like: Tensor) -> Float[Tensor, "bodies 63"]:
 
 
 def spreads(bodies: int, like: Tensor, loose: tuple[str, ...] = ()) -> Float[Tensor, "bodies 63"]:
-    """How far each angle is from its rest in daily life [rad].
+    """How far each angle of identical rows is from its rest in daily life [rad].
 
-    Args:
-        bodies: Number of identical rows.
-        like: For type and device.
-        loose: Joints that may be anywhere: the deviation of what is uniform in their ranges.
+    Joints that are `loose` may be anywhere: the deviation of what is uniform in their ranges.
     """
     low, high, _, spread = limit_table().to(like)
     free = torch.tensor([any(name in joint for name in loose) for joint in BODY[1:]])
@@ -146,13 +143,9 @@ def stature_of(
     person: Int[Tensor, " bodies"],
     rows: Int[Tensor, " some"],
 ) -> Stature:
-    """The prior of the heights of the people in some rows.
+    """The prior of the heights of the people in the rows that are fitted.
 
-    Args:
-        model: The body model.
-        heights: Of each person in the order of their numbers, or one for everybody [m].
-        person: Their numbers in all rows.
-        rows: Those that are fitted.
+    `heights` [m] are of each person in the order of their numbers, or one for everybody.
 
     Raises:
         InputError: If there are others than there are people.

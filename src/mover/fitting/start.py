@@ -281,10 +281,7 @@ def turned_round(
 ) -> Bool[Tensor, "rows tries"]:
     """Hypotheses that lie against the way of most of the stretch of lying that a row is in.
 
-    Args:
-        trunks: Directions from pelvis to neck of all hypotheses.
-        best: The hypothesis that each row has, in the order of time.
-        up: About upright.
+    `trunks` point from pelvis to neck, `best` is the hypothesis of each row, in the order of time.
     """
     lies = (trunks @ up).abs() < LIES
     own = trunks[torch.arange(len(best)), best]

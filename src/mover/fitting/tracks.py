@@ -60,10 +60,7 @@ def motion_of(
 ) -> TrackMotion:
     """Neighbours in time of each person, and how much they accelerate.
 
-    Args:
-        keypoints: Their rows.
-        speed: How fast the joints of each body seem to move [m/s]; None: not known.
-        config: How much people accelerate.
+    `speed` is how fast the joints of each body seem to move [m/s]; None: not known.
     """
     near = gather_neighbours(keypoints.frame, keypoints.person, keypoints.fps)
     time = near.steps.prod(1)
@@ -79,14 +76,10 @@ def motion_of(
 def joint_speed(
     keypoints: Keypoints, there: Bool[Tensor, "rows layout"]
 ) -> Float[Tensor, "rows joints"]:
-    """How fast each joint moves in the image, not less than most keypoints do [px/s].
+    """How fast each joint moves in the image, not less than most keypoints that count do [px/s].
 
     The pelvis moves as most keypoints, joints that the layout lacks as their parents do. Infinite
-    where a joint is not seen and at the ends of a track.
-
-    Args:
-        keypoints: With a frame rate.
-        there: Which of them count.
+    where a joint is not seen and at the ends of a track. There has to be a frame rate.
     """
     assert keypoints.fps is not None
     each, names = torch.full(there.shape, torch.nan), LAYOUTS[keypoints.layout]

@@ -141,12 +141,10 @@ def networks() -> tuple[Path, Path] | None:
 
 
 def fetch(say: Callable[[str], None], source: Path | None = None) -> None:
-    """Bring the networks into the cache folder.
+    """Bring the networks into the cache folder, and say what was done.
 
-    Args:
-        say: For what was done.
-        source: The wheel, a bundle .task, or a landmark network .tflite (heavy) that is already
-            there; None: the wheel is downloaded by pip.
+    They come from a wheel, a bundle .task or a landmark network .tflite (heavy) that is already
+    there; None: the wheel is downloaded by pip.
 
     Raises:
         InputError: If they cannot be had, or are not what they should be.

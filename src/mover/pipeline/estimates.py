@@ -22,12 +22,10 @@ AXES = ("wide", "high", "deep")
 
 
 def lens_and_scale(camera: Camera, lens: float | None, size: float | None) -> tuple[str, str]:
-    """Lens and scale with their spreads, and what would narrow them.
+    """Lens and scale of a room with their spreads, and what would narrow them.
 
-    Args:
-        camera: Of the room.
-        lens: Standard deviation of the logarithm of its focal length; None: not stated.
-        size: The same of all lengths together; 0: it was given; None: no people.
+    `lens` is the standard deviation of the logarithm of the focal length, None: not stated; `size`
+    that of all lengths together, 0: it was given, None: no people.
     """
     focal = float(camera.K[0, 0])
     across = math.degrees(2 * math.atan(camera.width / (2 * focal)))

@@ -86,13 +86,9 @@ def refined_room(room: Room, capture: Capture, observe: Observer = silent) -> Ro
 
 
 def measure_people(out: Path, truth: Path | None = None) -> dict[str, dict[str, float]]:
-    """How the people of a result move before and after their refinement.
+    """How the people of a result move before and after their refinement, in refined/metrics.json.
 
-    Writes OUT/refined/metrics.json.
-
-    Args:
-        out: Folder of the result.
-        truth: Folder of the true scene and people, for their errors.
+    `truth` is the folder of the true scene and people, for their errors.
 
     Raises:
         InputError: If a file is missing or wrong.

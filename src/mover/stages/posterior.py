@@ -55,13 +55,9 @@ class Observations:
         spreads: Float[Tensor, "*rows"] | float,
         robust: bool = False,
     ) -> None:
-        """Observe.
+        """Observe values with errors of such standard deviations, linear in the unknowns.
 
-        Args:
-            slopes: By the unknowns.
-            values: What was observed.
-            spreads: Standard deviations of the errors.
-            robust: Whether the errors have Student's distribution, as some are plainly wrong.
+        With `robust` errors have Student's distribution, as some are plainly wrong.
         """
         shape = slopes.shape[:-1]
         for rows, value in ((self.values, values), (self.spreads, spreads), (self.robust, robust)):

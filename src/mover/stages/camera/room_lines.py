@@ -169,10 +169,7 @@ def _sides(
 def fit_room(segments: Segments, prior: Prior, R_cam_world: Float[Tensor, "3 3"]) -> Ends:
     """The cameras under which the segments run along three directions at right angles.
 
-    Args:
-        segments: Of a picture.
-        prior: Of the camera.
-        R_cam_world: Its first guess; the headings of the room are sought from there.
+    The headings of the room are sought from the first guess `R_cam_world`.
     """
     heading = torch.arange(HEADINGS, dtype=torch.float64) * (torch.pi / 2 / HEADINGS)
     R = R_cam_world.double().cpu() @ rot_y(heading)

@@ -71,14 +71,10 @@ def thin(
     groups: int,
     limits: tuple[float, int],
 ) -> tuple[Float[Tensor, "groups most 3"], Float[Tensor, "groups most"]]:
-    """One point, their mean, for all points of a group in one cell; and how many they were.
+    """One point [m], their mean, for all points of a group in one cell; and how many they were.
 
-    Args:
-        points: All points [m].
-        group: Group of each point.
-        groups: Number of groups.
-        limits: Edge of a cell [m], and the number of points of a group that are kept at most:
-            where there are more cells, evenly chosen ones stand for all.
+    `limits` are the edge of a cell [m] and the most points of a group: where there are more cells,
+    evenly chosen ones stand for all.
     """
     cell, most = limits
     key = torch.cat([group.unsqueeze(-1), (points / cell).floor().long()], -1)

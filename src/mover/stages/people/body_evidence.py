@@ -116,9 +116,7 @@ def shape_uncertainty(
 ) -> Float[Tensor, " objects"]:
     """Usual error of the surface position of each object, estimated from its silhouette [m].
 
-    Args:
-        piece: Index of the drawn object; -1: none.
-        masks: Where each was detected.
+    `piece` is the index of the drawn object (-1: none), the masks are where each was detected.
     """
     shown = masks.any(0)
     found = torch.zeros(len(masks))

@@ -46,12 +46,9 @@ NUDGE = 1e-3  # [rad], for differences
 
 
 def plant_feet(bodies: Bodies, parts: BodyParts, floor: float) -> Bodies:
-    """The bodies with their resting soles still and on the floor.
+    """The bodies, in the world, with their resting soles still and on the floor [m].
 
-    Args:
-        bodies: In the world; a video. Unordered images have no rest, and come back as they are.
-        parts: Parts of their mesh.
-        floor: Its height in their room [m].
+    Unordered images have no rest, and come back as they are.
     """
     near = gather_neighbours(bodies.frame, bodies.person, bodies.fps)
     posture = postures(bodies, parts, floor)
