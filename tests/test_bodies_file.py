@@ -1,4 +1,3 @@
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,6 @@ from mover.bodies import load_model
 from mover.bodies.skinning import open_body, zero_pose
 from mover.core.errors import InputError
 from mover.core.types import BodyPose
-from mover.geometry.rotations import axis_angle
 from mover.io.capture.bodies_file import read_bodies, write_bodies
 from mover.io.capture.folder import read_capture
 from mover.io.capture.pose_file import into_camera
@@ -161,29 +159,3 @@ def test_parameters_of_world_bodies_turn_with_their_meshes(tmp_path):
     assert found.pose is not None
     again, _ = MODEL.posed(found.pose)
     assert torch.allclose(again, found.verts, atol=2e-5)
-
-
-@dataclass(frozen=True)
-class Puppet:
-    """A stiff body whose pelvis is not at its origin, as SMPL's is not."""
-
-    name: str = "smplx"
-    joint_names: tuple[str, ...] = ("pelvis",)
-
-    @property
-    def faces(self) -> torch.Tensor:
-        return torch.from_numpy(tiny.BODY_FACES)
-
-    def posed(self, pose: BodyPose) -> tuple[torch.Tensor, torch.Tensor]:
-        pelvis = torch.tensor([0.1, -0.35, 0.02])
-        turned = (torch.from_numpy(tiny.BODY).float() - pelvis) @ axis_angle(pose.global_orient).mT
-        return (turned + pelvis + pose.transl[:, None]), (pelvis + pose.transl)[:, None]
-
-
-def test_the_root_turns_about_the_pelvis(tmp_path, monkeypatch):
-    monkeypatch.setattr("mover.io.capture.pose_file.load_model", lambda *_: Puppet())
-    given = {**parameters(), "model": np.array("smplx")}
-    world, _ = read(save(tmp_path, **{**rows(), "space": np.array("world")}, **given))
-    found = into_camera(world, torch.from_numpy(tiny.rotation(-0.3, 0.1, 0.8)).float())
-    assert found.pose is not None
-    assert torch.allclose(Puppet().posed(found.pose)[0], found.verts, atol=1e-5)

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import tiny_capture as tiny
 import torch
 from analytic import GROUND, make_inputs
 from PIL import Image
@@ -62,11 +63,8 @@ def inputs():
 
 
 @pytest.fixture(scope="module")
-def values(small_room):
-    """Any depth of the room's picture."""
-    camera = small_room.capture.scene.camera
-    generator = torch.Generator().manual_seed(1)
-    return torch.rand(camera.height, camera.width, generator=generator) + 1
+def capture(tmp_path_factory):
+    return read_capture(tiny.write_capture(tmp_path_factory.mktemp("tiny") / "tiny"))
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.15, 0.85])
@@ -108,12 +106,13 @@ def test_a_wrong_distance_costs_the_same_in_windows_of_fewer_pixels():
 
 
 def test_a_capture_keeps_its_depth_an_import_takes_it_along_and_the_newer_one_counts(
-    tmp_path, small_room, values
+    tmp_path, capture
 ):
-    values = torch.cat([torch.full_like(values[:5], torch.nan), values[5:]])
+    generator = torch.Generator().manual_seed(1)
+    values = torch.rand(tiny.HEIGHT, tiny.WIDTH, generator=generator) + 1
+    values[:5] = torch.nan
     for name, metric in (("depth", True), ("disparity", False)):
-        capture = replace(small_room.capture, depth=DepthImage(values, metric))
-        write_capture(capture, tmp_path / name)
+        write_capture(replace(capture, depth=DepthImage(values, metric)), tmp_path / name)
         made = import_into(tmp_path / "own", folder_parts(tmp_path / name))
         assert f"{name}/" in made.written
         for folder in (name, "own"):
@@ -121,15 +120,15 @@ def test_a_capture_keeps_its_depth_an_import_takes_it_along_and_the_newer_one_co
             assert found.metric == metric
             assert torch.equal(found.values.nan_to_num(0), values.nan_to_num(0))
     with pytest.raises(ValueError, match="has depth, which the capture lacks"):
-        write_capture(small_room.capture, tmp_path / "depth")
-    write_capture(small_room.capture, tmp_path / "none")
+        write_capture(capture, tmp_path / "depth")
+    write_capture(capture, tmp_path / "none")
     made = import_into(tmp_path / "own", folder_parts(tmp_path / "none"))
     assert read_capture(tmp_path / "own").depth is not None
     assert "disparity/" not in made.written
 
 
-def test_inverse_depth_may_be_an_array_or_a_grey_picture(tmp_path, small_room):
-    camera = small_room.capture.scene.camera
+def test_inverse_depth_may_be_an_array_or_a_grey_picture(tmp_path, capture):
+    camera = capture.scene.camera
     folder = tmp_path / "disparity"
     folder.mkdir()
     values = np.random.default_rng(0).integers(1, 255, (camera.height, camera.width))
@@ -143,19 +142,19 @@ def test_inverse_depth_may_be_an_array_or_a_grey_picture(tmp_path, small_room):
 
 WHOLE_VIDEOS = {  # of MegaSaM, which halves the sides, and of VGGT, whose sides are 14 n pixels
     "depths": ("float16", lambda w, h: (h // 2, w // 2), ()),
-    "depth": ("float32", lambda w, h: (round(h / 14) * 14, round(w / 14) * 14), (1,)),
+    "depth": ("float32", lambda w, h: (h // 14 * 14, w // 14 * 14), (1,)),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("key", WHOLE_VIDEOS)
 def test_depths_of_a_whole_video_give_the_frame_of_the_reference_picture(
-    key, tmp_path, small_room, caplog
+    key, tmp_path, capture, caplog
 ):
-    camera = small_room.capture.scene.camera
+    camera = capture.scene.camera
     dtype, shape, tail = WHOLE_VIDEOS[key]
     size = shape(camera.width, camera.height)
     values = np.arange(1, 5)[:, None, None] * np.ones((4, *size))
-    write_capture(small_room.capture, tmp_path / "room")
+    write_capture(capture, tmp_path / "room")
     (tmp_path / "room" / "depth").mkdir()
     file = tmp_path / "room" / "depth" / "000000.npz"
     np.savez(file, **{key: values.reshape(4, *size, *tail).astype(dtype)})
@@ -173,16 +172,16 @@ def test_depths_of_a_whole_video_give_the_frame_of_the_reference_picture(
 
 @pytest.mark.parametrize("kind", ["npy", "png", "npz"])
 @pytest.mark.parametrize("folder", ["depth", "disparity"])
-def test_a_pipe_as_depth_is_refused_at_once(kind, folder, tmp_path, small_room):
+def test_a_pipe_as_depth_is_refused_at_once(kind, folder, tmp_path, capture):
     (tmp_path / folder).mkdir()
     os.mkfifo(tmp_path / folder / f"000000.{kind}")
     file, metric = find_depth_file(tmp_path)
     with pytest.raises(InputError, match=rf"000000\.{kind}: .*no such"):
-        read_depth(file, small_room.capture.scene.camera, metric=metric)
+        read_depth(file, capture.scene.camera, metric=metric)
 
 
-def test_what_is_wrong_with_measured_depth_is_one_sentence(tmp_path, small_room):
-    camera = small_room.capture.scene.camera
+def test_what_is_wrong_with_measured_depth_is_one_sentence(tmp_path, capture):
+    camera = capture.scene.camera
     assert find_depth_file(tmp_path) is None
     for folder, words in (
         ("depth", r"depth/: has no depth map, expected 000000\.npy or"),

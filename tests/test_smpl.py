@@ -319,7 +319,7 @@ def broken(arrays, **changes):
 
 
 def test_a_file_of_another_model_or_with_odd_arrays_is_refused_by_name(arrays, tmp_path):
-    good = arrays["smplx"]
+    good = arrays["smplx"] | {"posedirs": arrays["smplx"]["posedirs"].astype(np.float16)}  # small
     cases = [
         (arrays["smplh"], "'v_template' has 6890 vertices, those of smpl and smplh, expected 104"),
         (broken(good, posedirs=None), r"'posedirs' is missing.*found .*J_regressor.*weights"),
