@@ -111,11 +111,8 @@ def test_furniture_before_people_of_a_turned_camera_is_not_taken_for_their_depth
     reference[230:, 152:532] = True
     inputs = depth_inputs(moved(true, 1.03), masks_of(true, hidden=here))
     later = inputs.people.frame + 1
-    inputs = dataclasses.replace(
-        inputs,
-        bodies=dataclasses.replace(inputs.bodies, frame=later),
-        people=dataclasses.replace(inputs.people, frame=later),
-    )
+    bodies, people = (dataclasses.replace(x, frame=later) for x in (inputs.bodies, inputs.people))
+    inputs = dataclasses.replace(inputs, bodies=bodies, people=people)
     code, one = Masks(*SIZE, (encode(reference),)), torch.ones(1)
     cover = Cover(code, one.long(), 3.0 * one, STILL, path, K)
     known, bare = (

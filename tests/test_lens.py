@@ -1,6 +1,7 @@
 """The focal length from the straight lines of a picture (`find_lens`, `room_lines`)."""
 
 import dataclasses
+import functools
 import math
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from mover.core.run import Run
 from mover.core.types import Camera
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import project, tilted
-from mover.geometry.rotations import rot_y
+from mover.geometry.rotations import axis_angle, rot_y
 from mover.io.capture.folder import read_capture, write_capture
 from mover.pipeline.presets import PAPER, ROBUST
 from mover.pipeline.reconstruct import reconstruct
@@ -45,13 +46,16 @@ def camera_of(focal: float, pitch: float = -0.2, roll: float = 0.02) -> Camera:
     return Camera(K, tilted(torch.tensor(pitch), torch.tensor(roll)), W, H)
 
 
-def drawn(heading: float, seed: int, **boxes: int):
-    """A picture of boxes by OpenCV's pencil: a maker that shares nothing with the method."""
-    return boxes_drawn(heading, seed, **boxes)[0]
+def lines_in(picture, masks=None):
+    return find_segments(picture, None, torch.tensor([W / 2, H / 2]), masks=masks)
 
 
-def boxes_drawn(heading, seed, boxes=9, askew=0, only=None, off=(0.0, 0.0), solid=False):
-    """The picture of boxes' edges and their masks; solid ones hide each other."""
+@functools.cache
+def drawn(heading, seed, boxes=9, askew=0, only=None, off=(0.0, 0.0), solid=False):
+    """Lines of a picture of boxes' edges by OpenCV, which shares nothing with the method.
+
+    Solid boxes hide each other, and have masks.
+    """
     rng, camera = np.random.default_rng(seed), camera_of(FOCAL)
     picture = np.full((H, W, 3), 235, np.uint8)
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float) - 0.5
@@ -80,12 +84,11 @@ def boxes_drawn(heading, seed, boxes=9, askew=0, only=None, off=(0.0, 0.0), soli
                 cv2.line(picture, *ends, (60, 70, 80), 2, cv2.LINE_AA, 4)
     noisy = picture + rng.normal(0, 4, picture.shape)
     masks = torch.from_numpy(label) == torch.arange(1, len(made) + 1)[:, None, None]
-    return torch.from_numpy(noisy.clip(0, 255) / 255).float(), masks
+    return lines_in(torch.from_numpy(noisy.clip(0, 255) / 255).float(), masks if solid else None)
 
 
-def lens_of(picture: torch.Tensor, focal: float, spread: float | None, masks=None):
+def lens_of(segments: Segments, focal: float, spread: float | None):
     camera = camera_of(focal, -0.17, 0.0)  # tilt is known to some degrees
-    segments = find_segments(picture, None, camera.K[:2, 2], masks=masks)
     return find_lens(LensInputs(segments, camera, spread, ON.tilt), ON)
 
 
@@ -108,19 +111,23 @@ def test_the_heading_of_a_room_is_found_from_what_stands_along_it(heading: float
     assert abs(found.tilt.pitch + 0.2) < math.radians(0.5)
 
 
+@pytest.mark.slow
 def test_the_stated_error_holds():
     found = [lens_of(drawn(0.1 * k, seed=k, askew=3), 1.06 * FOCAL, 0.055) for k in range(10)]
     off = [math.log(one.zoom * 1.06) / one.spread for one in found if one.spread]
     assert math.sqrt(np.mean(np.square(off))) < 1.5
 
 
-@pytest.mark.parametrize("off", [(0.0, 0.0), (3.0, 8.0), (3.0, 15.0)])
-def test_right_angles_of_each_object_give_the_lens_wherever_it_is_turned(off):
+@pytest.mark.parametrize(
+    ("off", "count"),
+    [((3.0, 8.0), 3), *(pytest.param(off, 12, marks=pytest.mark.slow)
+                        for off in ((0.0, 0.0), (3.0, 8.0), (3.0, 15.0)))],
+)  # fmt: skip
+def test_right_angles_of_each_object_give_the_lens_wherever_it_is_turned(off, count):
     errors, spreads = [], []
-    for seed in range(12):
+    for seed in range(count):
         guess = math.exp(0.055 * np.random.default_rng(seed + 100).standard_normal())
-        picture, masks = boxes_drawn(0.3, seed, off=off, solid=True)
-        found = lens_of(picture, guess * FOCAL, 0.055, masks)
+        found = lens_of(drawn(0.3, seed, off=off, solid=True), guess * FOCAL, 0.055)
         errors.append(math.log(found.zoom * guess))
         spreads.append(found.spread)
     rms, spread = (float(np.sqrt(np.mean(np.square(x)))) for x in (errors, spreads))
@@ -146,12 +153,11 @@ def test_a_stated_guess_that_lines_correct_is_a_sentence(off: float, word: str):
 
 @pytest.mark.parametrize("picture", ["blank", "verticals", "noise"])
 def test_a_picture_without_evidence_leaves_the_lens(picture: str):
-    rng = torch.Generator().manual_seed(0)
     made = {
-        "blank": torch.full((H, W, 3), 0.5),
-        "verticals": drawn(0.4, seed=2, only=1),
-        "noise": torch.rand(H, W, 3, generator=rng),
-    }[picture]
+        "blank": lambda: lines_in(torch.full((H, W, 3), 0.5)),
+        "verticals": lambda: drawn(0.4, seed=2, only=1),
+        "noise": lambda: lines_in(torch.rand(H, W, 3, generator=torch.Generator().manual_seed(0))),
+    }[picture]()
     assert lens_of(made, 1.08 * FOCAL, None).zoom == 1
     declared = lens_of(made, 1.08 * FOCAL, 0.055)
     assert declared.spread > 0.04
@@ -183,11 +189,8 @@ def test_slopes_are_those_of_the_angles():
     R = (tilted(pitch, roll) @ rot_y(yaw))[None]
 
     def angles(x: torch.Tensor, turn: torch.Tensor):
-        from mover.geometry.rotations import axis_angle
-
-        return sines(segments, RoomPose(focal + x[:1], axis_angle(x[1:])[None] @ R, askew + turn))[
-            0
-        ]
+        pose = RoomPose(focal + x[:1], axis_angle(x[1:])[None] @ R, askew + turn)
+        return sines(segments, pose)[0]
 
     zero = torch.zeros(4, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
     common, turns = torch.autograd.functional.jacobian(angles, zero)
@@ -199,8 +202,6 @@ def test_slopes_are_those_of_the_angles():
 
 @pytest.mark.parametrize("plane", [False, True])
 def test_slopes_are_those_of_the_way_up(plane: bool):
-    from mover.geometry.rotations import axis_angle
-
     R = tilted(torch.tensor(-0.2), torch.tensor(0.1)).double()[None]
     up = tilted(torch.tensor(-0.25), torch.tensor(0.05)).double()[:, 1]
     prior = Prior(math.log(700), 0.05, up, 0.1, plane)
@@ -242,12 +243,9 @@ def test_the_whole_camera_is_found_in_exact_lines():
     gap = ends[:, 1] - ends[:, 0]
     length = gap.norm(dim=-1)
     segments = Segments(
-        ends.mean(1) - torch.tensor([W / 2, H / 2]),
-        gap / length[:, None],
-        1 / length,
-        torch.ones(60).double(),
-        torch.zeros(60).long(),
-    )
+        ends.mean(1) - torch.tensor([W / 2, H / 2]), gap / length[:, None], 1 / length,
+        torch.ones(60).double(), torch.zeros(60).long(),
+    )  # fmt: skip
     up = camera_of(FOCAL, -0.15, 0.0).R_cam_world[:, 1].double()
     prior = Prior(math.log(1.08 * FOCAL), 0.2, up, 0.1)
     found = fit_room(segments, prior, camera_of(FOCAL, -0.15, 0.0).R_cam_world)

@@ -78,9 +78,8 @@ def test_the_evidence_of_each_term_exists_and_silences_it_where_it_is_missing():
                 for x in (inputs.image, inputs.humans)
             )
             less = objective.SceneEvidence(inputs.objects, inputs.camera, image, humans)
-            left = objective.active_config(
-                SceneConfig(only(**dict.fromkeys(WEIGHTS, 1.0))), less
-            ).weights
+            all_on = SceneConfig(only(**dict.fromkeys(WEIGHTS, 1.0)))
+            left = objective.active_config(all_on, less).weights
             silent = {t.name for t in SCENE_TERMS if need in t.needs}
             assert {n for n in WEIGHTS if not getattr(left, n)} == silent
 
@@ -141,10 +140,8 @@ class TestANewcomer:
         weights = More(**{n: getattr(place.weights, n) for n in WEIGHTS})
         config = SceneConfig(weights, place.form)
         with use_engine(engine):
-            found = energy_function(*rest, config)(layout)
-            plain = energy_function(*rest, replace(config, weights=replace(weights, newcomer=0.0)))(
-                layout
-            )
+            less = replace(config, weights=replace(weights, newcomer=0.0))
+            found, plain = (energy_function(*rest, c)(layout) for c in (config, less))
             term = 0.7 * (layout.t_world_object[..., 0] - inputs.image.distance).square()
             torch.testing.assert_close(found.parts["newcomer"], term)
             torch.testing.assert_close(found.per_item, plain.per_item + term)

@@ -21,7 +21,6 @@ from mover.geometry.camera import outermost, project, to_camera
 from mover.geometry.placement import place, place_in
 from mover.pipeline.presets import Config
 from mover.stages.config import PlaceConfig
-from mover.stages.objects.place_inputs import Pinned, coarser_image
 from mover.stages.objects.place_objects import descend, energy_of, place_objects
 
 EXACT = BatchedBFGS(steps=400, gain=1e-12, least=1e-9, patience=10)
@@ -117,12 +116,6 @@ def test_a_problem_goes_its_way_whatever_else_is_in_the_batch(k):
     )
     torch.testing.assert_close(one.at.x[0], together.at.x[k], rtol=0, atol=1e-6)
     torch.testing.assert_close(one.value[0], together.value[k], rtol=1e-6, atol=1e-9)
-
-
-def test_two_runs_give_the_same_bits():
-    a, b = minimize_batched(valleys(9), BatchedBFGS()), minimize_batched(valleys(9), BatchedBFGS())
-    assert torch.equal(a.at.x, b.at.x)
-    assert torch.equal(a.value, b.value)
 
 
 def test_what_has_converged_leaves_the_batch_and_the_rest_goes_on():
@@ -248,12 +241,6 @@ class TestPlacing:
         one = descend(inputs, ROBUST, many[1], BatchedBFGS(steps=5), silent)
         torch.testing.assert_close(together.value[1:2], one.value, rtol=1e-3, atol=1e-5)
 
-    def test_its_energies_are_those_of_the_layout_it_returns(self):
-        inputs = make_inputs(size=32)
-        found = descend(inputs, ROBUST, moved(inputs.starts, 1, 0.1), BatchedBFGS(steps=8), silent)
-        there = energy_of(inputs, ROBUST)(found.at).per_item
-        torch.testing.assert_close(found.value, there, rtol=1e-4, atol=1e-6)
-
     def test_the_evidence_is_prepared_once_whatever_leaves_the_batch(self, monkeypatch):
         pytest.importorskip("warp")
         inputs, packed = make_inputs(size=32), []
@@ -263,18 +250,6 @@ class TestPlacing:
             inputs, ROBUST, moved(inputs.starts, 1, 0.1), BatchedBFGS(steps=8, patience=1), silent
         )
         assert len(packed) == 1
-
-    def test_pinned_objects_stay(self):
-        inputs = make_inputs(size=32)
-        off = moved(inputs.starts, 5, 0.2)
-        n = off.yaw.shape[-1]
-        held = Layout(off.t_world_object[0] + 0.05, off.yaw[0] + 0.1, off.log_scale[0])
-        fixed = torch.arange(n) == 0
-        inputs = replace(inputs, starts=off, pinned=Pinned(fixed, held))
-        placed = place_objects(inputs, ROBUST).layout
-        assert torch.equal(placed.yaw[0], held.yaw[0])
-        assert torch.equal(placed.t_world_object[0, [0, 2]], held.t_world_object[0, [0, 2]])
-        assert not torch.equal(placed.yaw[1:], off.yaw[0, 1:])
 
     def test_a_load_moves_with_what_carries_it(self):
         inputs = make_inputs(size=32)
@@ -340,10 +315,3 @@ class TestFasterTerms:
         few, every = project(outermost(points, K), K), project(points, K)
         torch.testing.assert_close(few.amin(-2), every.amin(-2), rtol=0, atol=0)
         torch.testing.assert_close(few.amax(-2), every.amax(-2), rtol=0, atol=0)
-
-    def test_coarser_masks_keep_their_area(self):
-        image = make_inputs(size=32).image
-        small = coarser_image(image, 4)
-        torch.testing.assert_close(small.masks.sum((-2, -1)) * 16, image.masks.sum((-2, -1)))
-        with pytest.raises(ValueError, match="which 5 does not divide"):
-            coarser_image(image, 5)

@@ -66,11 +66,19 @@ def matrix_file(models, folder):
     return official(folder / "transfer_data" / "smpl2smplx_deftrafo_setup.pkl", dense)
 
 
-def test_the_official_matrix_gives_smplx_the_vertices_of_smpl(models, matrix_file, monkeypatch):
+@pytest.fixture(scope="module")
+def moved(models, matrix_file):
+    """People of SMPL, and as SMPL-X."""
+    source = people(models["smpl"], 2)
+    return source, as_smplx(source, models["smpl"], models["smplx"], read_matrix(matrix_file))
+
+
+def test_the_official_matrix_gives_smplx_the_vertices_of_smpl(
+    models, matrix_file, moved, monkeypatch
+):
     monkeypatch.setenv(FOLDER, str(matrix_file.parents[1]))
     assert find_matrix() == matrix_file
-    source = people(models["smpl"], 2)
-    found = as_smplx(source, models["smpl"], models["smplx"], read_matrix(matrix_file))
+    source, found = moved
     assert found.model == "smplx"
     assert torch.equal(found.betas[0], found.betas[1])
     verts = models["smpl"].posed(source)[0].numpy()
@@ -82,21 +90,20 @@ def test_the_official_matrix_gives_smplx_the_vertices_of_smpl(models, matrix_fil
 
 
 def test_a_fit_of_smplx_starts_from_smpl_by_the_matrix_or_by_its_angles(
-    models, matrix_file, monkeypatch
+    matrix_file, moved, monkeypatch
 ):
-    source = people(models["smpl"], 2)
+    source, wanted = moved
     monkeypatch.delenv(FOLDER, raising=False)
     assert _by_matrix(source) is source
     monkeypatch.setenv(FOLDER, str(matrix_file.parents[1]))
-    wanted = as_smplx(source, models["smpl"], models["smplx"], read_matrix(matrix_file))
     torch.testing.assert_close(_by_matrix(source).body_pose, wanted.body_pose)
 
 
 def test_rows_of_a_matrix_are_those_of_the_file(matrix_file):
     matrix = read_matrix(matrix_file)
     with open(matrix_file, "rb") as file:
-        full = pickle.load(file)["mtx"].toarray()[:, :6890]
-    some = full[matrix.target]
+        full = pickle.load(file)["mtx"].tocsr()[:, :6890]
+    some = full[np.asarray(matrix.target)].toarray()
     np.testing.assert_allclose(matrix.mix, some[:, matrix.source], atol=1e-7)
     assert np.count_nonzero(some) == int((matrix.mix != 0).sum())
     assert len(matrix.target) == 1200

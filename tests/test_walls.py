@@ -1,5 +1,6 @@
 """Furniture along a wall: what a line costs, who tells it to whom, and where hidden bases end."""
 
+import functools
 import math
 from dataclasses import fields, replace
 
@@ -118,6 +119,12 @@ def a_row(names=("cabinet", "cabinet", "cabinet", "shelf"), off=(0.0, 0.04, -0.0
     return layout_of(places, [0.0] * len(names)), objects, torch.full((len(names), 4), SEEN)
 
 
+def walls_along(*room):
+    walls = find_walls(*room)
+    assert walls is not None
+    return walls
+
+
 def naive_lines(layout, objects, sides):
     """Normal, offset and trust of each line, by loops."""
     n, able = len(objects.ids), []
@@ -176,8 +183,7 @@ class TestLines:
     def test_three_in_a_row_tell_it_to_one_that_is_far_off_and_hears_nothing_of_itself(self):
         layout, objects, sides = a_row()
         sides[3, BOTTOM] = LEAST
-        walls = find_walls(layout, objects, sides)
-        assert walls is not None
+        walls = walls_along(layout, objects, sides)
         torch.testing.assert_close(walls.out, torch.tensor([[0.0, -1.0]] * 4).double())
         assert walls.offset.tolist() == pytest.approx([5.0, 5.0, 5.0, 4.0])
         others = 1 - torch.eye(4).double()
@@ -189,8 +195,7 @@ class TestLines:
     def test_one_piece_and_a_line_of_its_own_tell_nothing(self):
         for names in (("table",), ("cabinet",), ("cabinet", "table", "bench", "chair")):
             assert find_walls(*a_row(names, [0.0] * len(names))) is None
-        walls = find_walls(*a_row(("cabinet", "shelf"), (0.0, 0.8)))
-        assert walls is not None
+        walls = walls_along(*a_row(("cabinet", "shelf"), (0.0, 0.8)))
         assert torch.equal(walls.trust, 1 - torch.eye(2).double())
 
 
@@ -204,8 +209,7 @@ class TestStarts:
             ("cabinet", "shelf", "table", "bed", "sofa"), (1.2 * off).tolist()
         )
         layout = replace(layout, yaw=turn)
-        walls = find_walls(layout, objects, sides)
-        assert walls is not None
+        walls = walls_along(layout, objects, sides)
         found = starts_at(layout, objects, walls)
         assert len(found.yaw) == 1 + len(walls.offset)
         for f in fields(Layout):
@@ -234,8 +238,7 @@ class TestStarts:
 
     def test_what_would_have_to_go_too_far_or_to_turn_too_much_stays(self):
         layout, objects, sides = a_row(("cabinet",) * 4, (0.0,) * 4)
-        walls = find_walls(layout, objects, sides)
-        assert walls is not None
+        walls = walls_along(layout, objects, sides)
         t, yaw = layout.t_world_object.clone(), layout.yaw.clone()
         t[0, 2] = WALL / (STRETCH[1] + 0.1)
         t[1, 2] = WALL / (STRETCH[0] - 0.05)
@@ -267,6 +270,12 @@ def a_hidden_shelf(given_at, size=48):
     return truth, PlaceInputs(objects, camera, GROUND, image, HumanCues(), start, truth.yaw)
 
 
+@functools.cache
+def lined(given_at):
+    """Where the descent with lines puts a hidden shelf."""
+    return place_objects(a_hidden_shelf(given_at)[1], CONFIG)
+
+
 CONFIG = replace(
     ROBUST.place, method=BatchedBFGS(),
     weights=replace(ROBUST.place.weights, given=0.0, measured=0.0),  # in tests of their own
@@ -278,29 +287,28 @@ class TestPlacing:
     @pytest.mark.parametrize("given_at", [0.93, 1.06])
     def test_a_shelf_whose_base_is_hidden_stands_where_its_neighbours_stand(self, given_at):
         truth, inputs = a_hidden_shelf(given_at)
-        lined, plain = (place_objects(inputs, config) for config in (CONFIG, UNLINED))
+        found, plain = lined(given_at), place_objects(inputs, UNLINED)
 
         def error(placed):
             return (placed.layout.t_world_object - truth.t_world_object).norm(dim=-1)
 
         assert plain.walls is None
-        assert lined.walls is not None
-        assert lined.walls.trust.amax(-1).tolist() == pytest.approx([1, 1, 1, 0])
+        assert found.walls is not None
+        assert found.walls.trust.amax(-1).tolist() == pytest.approx([1, 1, 1, 0])
         assert float(error(plain)[1]) > 0.25
-        assert float(error(lined)[1]) < 0.15 * float(error(plain)[1])
-        assert float(error(lined)[[0, 2]].max()) < 0.02
-        count = len(lined.energy)
+        assert float(error(found)[1]) < 0.15 * float(error(plain)[1])
+        assert float(error(found)[[0, 2]].max()) < 0.02
+        count = len(found.energy)
         for name in (f.name for f in fields(Layout)):
-            one, other = getattr(lined.layout, name), getattr(plain.layout, name)
+            one, other = getattr(found.layout, name), getattr(plain.layout, name)
             assert torch.equal(one[3], other[3]), name
-            one, other = getattr(lined.candidates, name), getattr(plain.candidates, name)
+            one, other = getattr(found.candidates, name), getattr(plain.candidates, name)
             assert torch.equal(one[:, 3], other[:count, 3]), name
-        assert torch.equal(lined.energy[:, 3], plain.energy[:count, 3])
-        assert (lined.energy.diff(dim=0) >= 0).all()
+        assert torch.equal(found.energy[:, 3], plain.energy[:count, 3])
+        assert (found.energy.diff(dim=0) >= 0).all()
 
     def test_its_energies_are_those_of_its_candidates_under_the_lines_that_it_names(self):
-        _, inputs = a_hidden_shelf(0.93)
-        placed = place_objects(inputs, CONFIG)
+        inputs, placed = a_hidden_shelf(0.93)[1], lined(0.93)
         found = energy_of(with_walls(inputs, placed.walls), CONFIG)(placed.candidates)
         torch.testing.assert_close(placed.energy, found.per_item, rtol=1e-4, atol=1e-6)
         assert float(found.parts["wall"][:, :3].amax()) > 0
