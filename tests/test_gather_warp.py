@@ -10,7 +10,7 @@ from test_volume import around, assert_same, moving_spheres, sphere
 
 from mover.core.types import Bodies, Camera, People
 from mover.energy.human_terms import BodyView, DepthMaps, bounds_of, merge
-from mover.geometry import volume_warp
+from mover.geometry import volume
 from mover.geometry.raster import Crops, layers
 from mover.geometry.volume import Volume, grid_around, sample, sample_torch
 from mover.stages.config import GatherConfig
@@ -39,14 +39,14 @@ def test_a_body_that_leaves_the_grid_is_cut_off() -> None:
     corner = torch.tensor([10.0, 18, 0])
     part = Volume(whole.values[10:25, 18:39, :13], whole.origin + whole.cell * corner, whole.cell)
     assert (assert_same(verts[None], faces, part) < 0).any()
-    away = volume_warp.union_bodies(verts[None] + 9, faces, part, 2).values
+    away = volume.union_bodies(verts[None] + 9, faces, part, 2).values
     assert torch.equal(away, part.values)
 
 
 def test_no_frames_leave_the_grid_as_it_was() -> None:
     verts, faces = moving_spheres(2)
     grid = around(verts, 20)
-    assert torch.equal(volume_warp.union_bodies(verts[:0], faces, grid, 2).values, grid.values)
+    assert torch.equal(volume.union_bodies(verts[:0], faces, grid, 2).values, grid.values)
 
 
 @pytest.mark.parametrize("wrong", [torch.inf, torch.nan])
@@ -55,7 +55,7 @@ def test_vertices_that_are_not_finite_are_refused_by_their_body(wrong: float) ->
     grid = around(verts, 20)
     verts[7, 3] = wrong
     with pytest.raises(ValueError, match="body 7"):
-        volume_warp.union_bodies(verts, faces, grid, 3)
+        volume.union_bodies(verts, faces, grid, 3)
 
 
 SETTINGS = GatherConfig(erode=2)
@@ -145,7 +145,7 @@ def test_triangles_without_an_area_change_nothing() -> None:
     extra = torch.tensor([[0, 1, 2], [0, 3, 2], [4, 5, 6], [6, 4, 5], [5, 6, 7], [7, 4, 4]])
     verts, both = torch.cat([one, more])[None], torch.cat([faces, extra + len(one)])
     grid = around(verts, 50)
-    found = volume_warp.union_bodies(verts, both, grid, 1).values
+    found = volume.union_bodies(verts, both, grid, 1).values
     assert torch.equal(found, assert_same(verts, faces, grid))
 
 

@@ -12,8 +12,14 @@ from torch import Tensor
 from mover.bodies.skinning import open_body, zero_pose
 from mover.geometry.nearest import nearest_points, to_surface
 from mover.geometry.topology import is_closed
-from mover.geometry.volume import Volume, grid_around, sample, signed_distance, winding
-from mover.geometry.volume_warp import union_bodies
+from mover.geometry.volume import (
+    Volume,
+    grid_around,
+    sample,
+    signed_distance,
+    union_bodies,
+    winding,
+)
 
 
 def sphere(center: list[float], radius: float, level: int = 4) -> tuple[Tensor, Tensor]:

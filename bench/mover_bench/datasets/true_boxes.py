@@ -119,7 +119,8 @@ def boxes_scene(
     meshes: dict[str, tuple[Mesh, str]] = {}
     for box in boxes:
         order, signs, yaw = _upright(box.axes @ world[:3, :3].T)
-        mesh = _cuboid(box, order) if scan is None else _inside(scan, box, order, signs)
+        own = Mesh(torch.from_numpy(SIGNS * box.half[order]).float(), torch.from_numpy(FACES))
+        mesh = own if scan is None else _inside(scan, box, order, signs)
         if mesh is None:
             continue
         name = free_id(box.category, box.name, meshes)
@@ -153,12 +154,6 @@ def _upright(axes: Matrix) -> tuple[list[int], Matrix, float]:
     signs = np.array([1.0, math.copysign(1.0, axes[up, 1]), 1.0])
     signs[0] = math.copysign(1.0, float(np.linalg.det(axes[order] * signs[:, None])))
     return order, signs, math.atan2(axes[front, 0], axes[front, 2])
-
-
-def _cuboid(box: TrueBox, order: Sequence[int]) -> Mesh:
-    """The box itself, about its centre."""
-    verts = SIGNS * box.half[list(order)]
-    return Mesh(torch.from_numpy(verts).float(), torch.from_numpy(FACES))
 
 
 def _inside(scan: Mesh, box: TrueBox, order: Sequence[int], signs: Matrix) -> Mesh | None:

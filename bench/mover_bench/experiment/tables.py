@@ -128,12 +128,6 @@ def read_finished(out: Path, rooms: str, seeds: Sequence[int], names: Sequence[s
     return Finished(rows, things, lacking, tuple(sorted(versions)))
 
 
-def by_room(frame: Frame) -> Frame:
-    """Means over the variants of a row: a line for each row, stage and room."""
-    columns = [name for name in COLUMNS if name in frame]
-    return frame.groupby(["row", "stage", "seed"])[columns].mean()
-
-
 def write_tables(args: ExperimentArgs, names: Sequence[str], found: Finished) -> Path:
     """Write results.csv, summary.csv and summary.md into OUT/SET; returns the latter."""
     folder = args.out / args.set
@@ -168,7 +162,8 @@ def page_of(args: ExperimentArgs, names: Sequence[str], found: Finished) -> str:
         return "\n\n".join(lines) + "\n"
     rows = list(dict.fromkeys(VARIANTS[name].row or name for name in names))
     lead = [(rows[0], "initial"), (rows[0], "image"), *((row, "full") for row in rows)]
-    means = by_room(found.scenes)
+    columns = [name for name in COLUMNS if name in found.scenes]  # means over a row's variants
+    means = found.scenes.groupby(["row", "stage", "seed"])[columns].mean()
     lines += ["## Mean over rooms", _means(means, lead)]
     lines += [f"## Difference from {rows[0]}", _differences(means, rows)] if rows[1:] else []
     return "\n\n".join(lines) + "\n"

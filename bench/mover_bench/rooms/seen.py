@@ -21,7 +21,7 @@ from mover.bodies.keypoints import LAYOUTS, SIDES, keypoints_of
 from mover.bodies.skinning import open_body
 from mover.core.observe import Observer, silent
 from mover.core.types import Camera, Capture, Keypoints, Masks, People
-from mover.geometry.camera import project
+from mover.geometry.camera import at_pixels, project
 from mover.geometry.rle import decode
 from mover.perceive.capture import Finders
 from mover.perceive.config import ModelsConfig, PerceiveConfig
@@ -97,7 +97,8 @@ class Seen:
         masks = [decode(tracks.masks, row) for row in range(len(tracks.frame))]
         rng = np.random.default_rng([self.seed, 17])
         exact = project(points, camera.K)
-        inside = torch.stack([_near(mask, xy) for mask, xy in zip(masks, exact, strict=True)])
+        seen = [at_pixels(m, xy.floor().long()) for m, xy in zip(masks, exact, strict=True)]
+        inside = torch.stack([shown & there for shown, there in seen])
         when = tracks.frame.numpy(), tracks.person.numpy()
         seconds = slow(rng, when, (17, 2), (inputs.clip.fps or 1.0) * GUESSED[1])
         pixels, sure = spoilt(points, inside, camera, tracks.person, seconds, rng)
@@ -165,14 +166,6 @@ def _attitude(points: Float[Tensor, "rows 17 3"]) -> Float[Tensor, "rows 3 3"]:
     spine = torch.nn.functional.normalize(spine, dim=-1)
     front = torch.nn.functional.normalize(torch.linalg.cross(across, spine), dim=-1)
     return torch.stack([torch.linalg.cross(spine, front), spine, front], -1)
-
-
-def _near(mask: Tensor, points: Tensor) -> Tensor:
-    """Which points lie in a mask."""
-    h, w = mask.shape
-    x, y = (points[:, i].floor().long() for i in (0, 1))
-    there = (x >= 0) & (x < w) & (y >= 0) & (y < h)
-    return there & mask[y.clamp(0, h - 1), x.clamp(0, w - 1)]
 
 
 def write_video(room: KnownRoom, path: Path) -> None:

@@ -26,8 +26,7 @@ from mover.geometry.topology import (
     solid,
     volumes,
 )
-from mover.geometry.volume import BAND, SHELL, Volume
-from mover.geometry.volume_warp import union_bodies
+from mover.geometry.volume import BAND, SHELL, Volume, union_bodies
 
 WALL = 0.75  # [cells], more than the half diagonal of a step, or the flood would leak through
 REST = 0.3  # of the thickness of the wall that stays: sheets need two sides that are apart

@@ -33,8 +33,7 @@ from mover.geometry.crops import sample_nearest
 from mover.geometry.mesh import coarser
 from mover.geometry.path import is_still, poses_at, resampled
 from mover.geometry.raster import Crops, Topology, depths, layers
-from mover.geometry.volume import grid_around
-from mover.geometry.volume_warp import union_bodies
+from mover.geometry.volume import grid_around, union_bodies
 from mover.stages.config import GatherConfig
 from mover.stages.masks import MaskTable, mask_table, small_camera, small_masks, small_views
 

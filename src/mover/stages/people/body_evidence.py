@@ -18,8 +18,7 @@ from mover.geometry.camera import project, to_camera
 from mover.geometry.mesh import sample_surface
 from mover.geometry.placement import place_object
 from mover.geometry.raster import Crops, first_hit, layers
-from mover.geometry.volume import Volume, grid_around
-from mover.geometry.volume_warp import union_bodies
+from mover.geometry.volume import Volume, grid_around, union_bodies
 from mover.stages.contacts.assign_contacts import evenly
 from mover.stages.masks import MaskTable, small_camera, small_masks, widened
 from mover.stages.objects.find_image_cues import image_evidence
