@@ -1,4 +1,5 @@
 import sys
+from functools import partial
 from importlib.machinery import PathFinder
 
 import pytest
@@ -37,6 +38,14 @@ def pytest_collection_modifyitems(items):
 
 
 @pytest.fixture(scope="session")
+def tiny():
+    """A known room that is made at once: three pieces, and a person who sits."""
+    from test_rooms import tiny_room
+
+    return tiny_room()
+
+
+@pytest.fixture(scope="session")
 def small_room():
     """A known room with few frames."""
     from kept_rooms import drawn, kept
@@ -44,6 +53,33 @@ def small_room():
     from mover_bench.rooms.config import RoomConfig
 
     return kept(drawn, 3, RoomConfig(width=480, height=270, stay=0.3, least_frames=60))
+
+
+@pytest.fixture(scope="session")
+def small_capture(small_room):
+    """What is given of the small room: with noise, and of every eighth frame of the people."""
+    from kept_rooms import thinned
+
+    from mover_bench.rooms.config import NoiseConfig
+    from mover_bench.rooms.noise import add_noise
+
+    return thinned(add_noise(small_room, NoiseConfig(), 1))
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Fits and rooms with few steps, for tests that ask whether they are there, not how good."""
+    from test_fit import QUICK
+    from test_perceive_layout import QUICK as LAYOUT
+    from test_pipeline import light
+
+    from mover.app.cli import video
+    from mover.fitting.config import FITS
+    from mover.pipeline.presets import PRESETS
+
+    monkeypatch.setattr(video, "LayoutArgs", partial(video.LayoutArgs, config=LAYOUT))
+    monkeypatch.setitem(PRESETS, "robust", light("robust"))
+    monkeypatch.setitem(FITS, "robust", QUICK)
 
 
 @pytest.fixture(scope="session")

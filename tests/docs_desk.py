@@ -9,45 +9,23 @@ import make_people
 import make_scenes
 import numpy as np
 import torch
+from kept_rooms import some
 from make_keypoints import CAMERA, as_bodies, seen, walker
 from make_smpl import make_model, write_npz
 
 from mover.app.results import write_truth
-from mover.core.records import rows_of
-from mover.core.types import Bodies, Capture
+from mover.core.types import Capture
 from mover.io.capture.bodies_file import write_bodies
 from mover.io.capture.camera_file import camera_to_json
 from mover.io.capture.edits import Place, placement_of, write_edits
 from mover.io.capture.folder import write_capture
 from mover.io.files.fields import write_json
 from mover.io.people.keypoints import write_keypoints
-from mover_bench.rooms.config import NoiseConfig
 from mover_bench.rooms.known import KnownRoom
-from mover_bench.rooms.noise import add_noise
 
 
-def some(bodies: Bodies, every: int = 8) -> Bodies:
-    """Bodies of every so many frames."""
-    return rows_of(bodies, bodies.frame % every == 0)
-
-
-def thinned(capture: Capture, every: int = 8) -> Capture:
-    """Every so many frames of the people."""
-    bodies, people = capture.bodies, capture.people
-    assert bodies is not None
-    assert people is not None
-    rows = (people.frame % every == 0).nonzero()[:, 0]
-    counts = tuple(people.masks.counts[k] for k in rows.tolist())
-    fewer = dataclasses.replace(
-        people, masks=dataclasses.replace(people.masks, counts=counts), frame=people.frame[rows],
-        person=people.person[rows],
-    )  # fmt: skip
-    return dataclasses.replace(capture, bodies=some(bodies, every), people=fewer)
-
-
-def write_captures(desk: Path, room: KnownRoom) -> None:
+def write_captures(desk: Path, room: KnownRoom, capture: Capture) -> None:
     """CAPTURE with its truth, DIR, a list of captures, a list of edits."""
-    capture = thinned(add_noise(room, NoiseConfig(), 1))
     write_capture(capture, desk / "CAPTURE")
     write_truth(room.truth, some(room.bodies), desk / "CAPTURE" / "truth")
     (desk / "DIR").symlink_to(Path("CAPTURE") / "truth")
@@ -105,11 +83,11 @@ def write_persons(desk: Path) -> None:
     write_npz(make_model("smplx"), desk / "models" / "smplx" / "SMPLX_NEUTRAL.npz")
 
 
-def write_desk(desk: Path, room: KnownRoom) -> Path:
+def write_desk(desk: Path, room: KnownRoom, capture: Capture) -> Path:
     """All of it but OUT, a finished result of CAPTURE."""
     shutil.rmtree(desk, ignore_errors=True)
     desk.mkdir()
-    write_captures(desk, room)
+    write_captures(desk, room, capture)
     write_scenes(desk, room)
     write_persons(desk)
     return desk

@@ -3,11 +3,13 @@
 import fcntl
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mover.core.observe import Observer, silent
+from mover.core.records import rows_of
 from mover.core.run import Run, sources
+from mover.core.types import Bodies, Capture
 from mover_bench.rooms.config import RoomConfig
 from mover_bench.rooms.known import KnownRoom, demo_room, make_room
 
@@ -54,3 +56,22 @@ def _forget(folder: Path) -> None:
     for path in files[FEW:]:
         path.unlink()
         path.with_suffix(".npz").unlink(missing_ok=True)
+
+
+def some(bodies: Bodies, every: int = 8) -> Bodies:
+    """Bodies of every so many frames."""
+    return rows_of(bodies, bodies.frame % every == 0)
+
+
+def thinned(capture: Capture, every: int = 8) -> Capture:
+    """Every so many frames of the people."""
+    bodies, people = capture.bodies, capture.people
+    assert bodies is not None
+    assert people is not None
+    rows = (people.frame % every == 0).nonzero()[:, 0]
+    counts = tuple(people.masks.counts[k] for k in rows.tolist())
+    fewer = replace(
+        people, masks=replace(people.masks, counts=counts), frame=people.frame[rows],
+        person=people.person[rows],
+    )  # fmt: skip
+    return replace(capture, bodies=some(bodies, every), people=fewer)

@@ -264,7 +264,7 @@ def test_without_ray_the_way_to_get_it_is_said_and_the_summary_has_its_head(tmp_
 @pytest.mark.slow
 def test_ray_gives_what_this_machine_gives(tmp_path: Path):
     pytest.importorskip("ray", reason="needs the extra ray")
-    fakes(tmp_path, 40, {1: "refuse", 2: "crash", 3: "slow"})
+    fakes(tmp_path, 10, {1: "refuse", 2: "crash", 3: "slow"})
     local, there = run_here(tmp_path, limit=3.0), jobs_of(tmp_path, 3.0, "there")
     found = run_batch(there, tmp_path / "there", 2, RayOptions(cpus=0.5))
     assert [outcome.state for outcome in found] == local

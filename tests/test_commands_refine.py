@@ -132,15 +132,11 @@ def test_contacts_without_their_source_name_the_missing_flag(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_a_run_ends_with_the_people_that_refine_would_give(tmp_path, small_room):
+def test_a_run_ends_with_the_people_that_refine_would_give(tmp_path, small_capture):
     """The room is the same, and its people are those of `mover refine` on the plain result."""
-    from docs_desk import thinned
-
     from mover.io.capture.folder import write_capture
-    from mover_bench.rooms.config import NoiseConfig
-    from mover_bench.rooms.noise import add_noise
 
-    write_capture(thinned(add_noise(small_room, NoiseConfig(), 1)), tmp_path / "capture")
+    write_capture(small_capture, tmp_path / "capture")
     write_json({"config": records.plain(light("robust"))}, tmp_path / "config.json")
     out = tmp_path / "out"
     run = [str(tmp_path / "capture"), "--out", str(out), "--config", str(tmp_path / "config.json")]

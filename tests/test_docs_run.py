@@ -59,8 +59,8 @@ BLOCKS = [pytest.param(lines, id=f"{page}-{i}") for i, (page, lines) in enumerat
 
 
 @pytest.fixture(scope="module")
-def full_desk(tmp_path_factory, small_room) -> Path:
-    desk = write_desk(tmp_path_factory.mktemp("docs") / "desk", small_room)
+def full_desk(tmp_path_factory, small_room, small_capture) -> Path:
+    desk = write_desk(tmp_path_factory.mktemp("docs") / "desk", small_room, small_capture)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(desk)
         assert run_command("run", ["CAPTURE", "--out", "OUT", *RUN]) == 0

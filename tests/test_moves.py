@@ -100,13 +100,18 @@ def test_people_before_an_object_do_not_move_it():
     assert stays(seen, people) == []
 
 
-def test_what_a_moved_object_hides_and_uncovers_stands_still():
-    chair = {True: patch(20, 40, 30, 30), False: patch(70, 40, 30, 30)}
-    bed = patch(15, 30, 90, 45)
-    seen = [(f, 1, bed & ~chair[f < 30]) for f in FRAMES]
-    seen += [(f, 2, chair[f < 30]) for f in FRAMES]
-    assert stays(seen) == [(2, 0), (2, 29)]
-    assert stays(seen, ASIDE) == [(2, 0), (2, 29)]
+@pytest.mark.parametrize(
+    ("chair", "bed", "people"),
+    [
+        ((patch(20, 40, 30, 30), patch(70, 40, 30, 30)), patch(15, 30, 90, 45), (None, ASIDE)),
+        ((patch(118, 40, 36, 48), patch(60, 20, 36, 68)), patch(15, 25, 80, 45), (ASIDE,)),
+    ],
+    ids=["hides and uncovers", "comes before it, which looks smaller"],
+)
+def test_what_a_moved_object_hides_stands_still(chair, bed, people):
+    seen = [(f, 1, bed & ~chair[f >= 30]) for f in FRAMES]
+    seen += [(f, 2, chair[f >= 30]) for f in FRAMES]
+    assert [stays(seen, some) for some in people] == [[(2, 0), (2, 29)]] * len(people)
 
 
 def pushed(share: float) -> torch.Tensor:
@@ -125,14 +130,6 @@ def test_what_is_pushed_straight_away_or_towards_the_camera_moves(frames: int):
         assert first == 0
         assert 24 <= second <= 24 + frames
         assert stays(seen) == []  # a person without a mask may be before it
-
-
-def test_what_comes_before_an_object_does_not_move_it_though_it_looks_smaller():
-    chair = {True: patch(118, 40, 36, 48), False: patch(60, 20, 36, 68)}
-    bed = patch(15, 25, 80, 45)
-    seen = [(f, 1, bed & ~chair[f < 30]) for f in FRAMES]
-    seen += [(f, 2, chair[f < 30]) for f in FRAMES]
-    assert stays(seen, ASIDE) == [(2, 0), (2, 29)]
 
 
 def test_a_glance_of_a_wrong_mask_is_no_move():

@@ -6,7 +6,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from test_rooms import shared_room
 
 from mover.bodies.skinning import open_body
 from mover.core.records import fingerprint, rows_of
@@ -25,14 +24,9 @@ SILENT = NoiseConfig(
 )  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def room() -> KnownRoom:
-    return shared_room()
-
-
-def noisy(room: KnownRoom, seed: int = 0, **errors: float) -> Capture:
+def noisy(tiny: KnownRoom, seed: int = 0, **errors: float) -> Capture:
     """A capture with these errors alone."""
-    return add_noise(room, dataclasses.replace(SILENT, **errors), seed)
+    return add_noise(tiny, dataclasses.replace(SILENT, **errors), seed)
 
 
 def posed(bodies: Bodies | None) -> tuple[Bodies, torch.Tensor, BodyPose]:
@@ -48,9 +42,9 @@ def shown(one: Detection) -> torch.Tensor:
     return decode(one.mask, 0)
 
 
-def pairs(room: KnownRoom, capture: Capture) -> list[tuple[SceneObject, SceneObject]]:
+def pairs(tiny: KnownRoom, capture: Capture) -> list[tuple[SceneObject, SceneObject]]:
     """The given and the true objects."""
-    return list(zip(capture.scene.objects, room.truth.objects, strict=True))
+    return list(zip(capture.scene.objects, tiny.truth.objects, strict=True))
 
 
 def centre(piece: SceneObject) -> torch.Tensor:
@@ -62,32 +56,32 @@ def size(piece: SceneObject) -> torch.Tensor:
     return (piece.mesh.verts.amax(0) - piece.mesh.verts.amin(0)) * piece.scale
 
 
-def test_no_noise_gives_the_truth_back(room: KnownRoom) -> None:
-    capture = noisy(room, 3)
-    for given, true in pairs(room, capture):
+def test_no_noise_gives_the_truth_back(tiny: KnownRoom) -> None:
+    capture = noisy(tiny, 3)
+    for given, true in pairs(tiny, capture):
         for name in ("t_world_object", "yaw", "scale"):
             assert torch.allclose(getattr(given, name), getattr(true, name), atol=1e-6)
-    assert torch.allclose(posed(capture.bodies)[0].verts, room.bodies.verts, atol=5e-5)
+    assert torch.allclose(posed(capture.bodies)[0].verts, tiny.bodies.verts, atol=5e-5)
     assert isinstance(capture.people, People)
-    assert isinstance(room.capture.people, People)
-    assert capture.people.masks.counts == room.capture.people.masks.counts
+    assert isinstance(tiny.capture.people, People)
+    assert capture.people.masks.counts == tiny.capture.people.masks.counts
     assert capture.scene.ground is None
 
 
-def test_noise_is_repeatable_differs_by_seed_and_leaves_the_truth(room: KnownRoom) -> None:
-    before = fingerprint(room)
-    first, again, other = (fingerprint(add_noise(room, NoiseConfig(), s)) for s in (1, 1, 2))
+def test_noise_is_repeatable_differs_by_seed_and_leaves_the_truth(tiny: KnownRoom) -> None:
+    before = fingerprint(tiny)
+    first, again, other = (fingerprint(add_noise(tiny, NoiseConfig(), s)) for s in (1, 1, 2))
     assert first == again
     assert first != other
-    assert fingerprint(room) == before
+    assert fingerprint(tiny) == before
 
 
 def test_a_wrong_camera_keeps_centres_in_the_camera_frame_and_projects_fronts(
-    room: KnownRoom,
+    tiny: KnownRoom,
 ) -> None:
-    capture = noisy(room, camera=5.0)
-    true, wrong = room.truth.camera.R_cam_world, capture.scene.camera.R_cam_world
-    for given, piece in pairs(room, capture):
+    capture = noisy(tiny, camera=5.0)
+    true, wrong = tiny.truth.camera.R_cam_world, capture.scene.camera.R_cam_world
+    for given, piece in pairs(tiny, capture):
         assert torch.allclose(wrong @ centre(given), true @ centre(piece), atol=1e-5)
         front = true @ torch.stack([piece.yaw.sin(), torch.tensor(0.0), piece.yaw.cos()])
         x, _, z = (wrong.mT @ front).tolist()
@@ -95,13 +89,13 @@ def test_a_wrong_camera_keeps_centres_in_the_camera_frame_and_projects_fronts(
         assert torch.allclose(given.scale, piece.scale, atol=1e-6)
 
 
-def test_camera_errors_have_the_stated_size(room: KnownRoom) -> None:
-    true, light = torch.stack(pitch_roll(room.truth.camera.R_cam_world)), _light(room)
+def test_camera_errors_have_the_stated_size(tiny: KnownRoom) -> None:
+    true, light = torch.stack(pitch_roll(tiny.truth.camera.R_cam_world)), _light(tiny)
     errors = []
     for seed in range(60):
         camera = noisy(light, seed, camera=3.0).scene.camera
         errors.append(torch.stack(pitch_roll(camera.R_cam_world)) - true)
-        assert torch.equal(camera.K, room.truth.camera.K)
+        assert torch.equal(camera.K, tiny.truth.camera.K)
         assert abs(float(camera.R_cam_world[2, 0])) < 1e-6, "a guess has no heading"
     degrees = torch.stack(errors).rad2deg()
     assert float(degrees.abs().min()) > 1.99
@@ -110,21 +104,21 @@ def test_camera_errors_have_the_stated_size(room: KnownRoom) -> None:
     assert abs(float(degrees.mean())) < 0.9
 
 
-def _light(room: KnownRoom) -> KnownRoom:
+def _light(tiny: KnownRoom) -> KnownRoom:
     """The room with three bodies only, for statistics over many seeds."""
     few = torch.arange(3)
-    bodies = rows_of(room.bodies, few)
-    assert isinstance(room.capture.people, People)
+    bodies = rows_of(tiny.bodies, few)
+    assert isinstance(tiny.capture.people, People)
     capture = dataclasses.replace(
-        room.capture, bodies=bodies, people=rows_of(room.capture.people, few)
+        tiny.capture, bodies=bodies, people=rows_of(tiny.capture.people, few)
     )
-    return dataclasses.replace(room, bodies=bodies, capture=capture)
+    return dataclasses.replace(tiny, bodies=bodies, capture=capture)
 
 
-def test_object_errors_have_the_stated_ranges_and_lie_along_the_ray(room: KnownRoom) -> None:
-    light, along, turn = _light(room), [], []
+def test_object_errors_have_the_stated_ranges_and_lie_along_the_ray(tiny: KnownRoom) -> None:
+    light, along, turn = _light(tiny), [], []
     for seed in range(60):
-        for given, true in pairs(room, noisy(light, seed, along_ray=0.3, yaw=30.0)):
+        for given, true in pairs(tiny, noisy(light, seed, along_ray=0.3, yaw=30.0)):
             c = centre(true)
             off, ray = centre(given) - c, c / c.norm()
             assert float((off - (off @ ray) * ray).norm()) < 1e-5
@@ -139,10 +133,10 @@ def test_object_errors_have_the_stated_ranges_and_lie_along_the_ray(room: KnownR
     assert abs(turn.std() - 30 / math.sqrt(3)) < 2
 
 
-def test_sizes_and_flips_follow_their_configuration(room: KnownRoom) -> None:
-    light, factors, quarters = _light(room), [], []
+def test_sizes_and_flips_follow_their_configuration(tiny: KnownRoom) -> None:
+    light, factors, quarters = _light(tiny), [], []
     for seed in range(60):
-        for given, true in pairs(room, noisy(light, seed, scale=0.15, flips=0.3)):
+        for given, true in pairs(tiny, noisy(light, seed, scale=0.15, flips=0.3)):
             factors.append(size(given) / size(true))
             turned = float(torch.remainder((given.yaw - true.yaw) / (math.pi / 2) + 0.5, 4) - 0.5)
             assert abs(turned - round(turned)) < 1e-4
@@ -156,9 +150,9 @@ def test_sizes_and_flips_follow_their_configuration(room: KnownRoom) -> None:
 
 
 @pytest.mark.parametrize("error", ["other_shapes", "wrong_class"])
-def test_other_shapes_and_classes_fill_the_same_box(room: KnownRoom, error: str) -> None:
-    capture = noisy(room, **{error: 1.0})
-    for (given, true), found in zip(pairs(room, capture), capture.detections, strict=True):
+def test_other_shapes_and_classes_fill_the_same_box(tiny: KnownRoom, error: str) -> None:
+    capture = noisy(tiny, **{error: 1.0})
+    for (given, true), found in zip(pairs(tiny, capture), capture.detections, strict=True):
         assert given.id == true.id
         assert torch.allclose(size(given), size(true), atol=1e-5)
         assert torch.allclose(centre(given), centre(true), atol=1e-5)
@@ -169,20 +163,20 @@ def test_other_shapes_and_classes_fill_the_same_box(room: KnownRoom, error: str)
             assert given.mesh.verts.shape != true.mesh.verts.shape
 
 
-def test_depth_bias_moves_a_body_along_its_ray_and_keeps_its_size(room: KnownRoom) -> None:
-    bodies, joints, _ = posed(noisy(room, 4, depth_bias=0.03).bodies)
-    pelvis, given = posed(room.bodies)[1][:, 0], joints[:, 0]
+def test_depth_bias_moves_a_body_along_its_ray_and_keeps_its_size(tiny: KnownRoom) -> None:
+    bodies, joints, _ = posed(noisy(tiny, 4, depth_bias=0.03).bodies)
+    pelvis, given = posed(tiny.bodies)[1][:, 0], joints[:, 0]
     factor = (given / pelvis)[:, 2]
     assert torch.allclose(given, pelvis * factor[:, None], atol=1e-4)
     assert float(factor.std()) < 1e-4
     assert 0 < abs(float(factor.mean()) - 1) <= 0.0301
     moved = bodies.verts - given[:, None]
-    assert torch.allclose(moved, room.bodies.verts - pelvis[:, None], atol=1e-4)
+    assert torch.allclose(moved, tiny.bodies.verts - pelvis[:, None], atol=1e-4)
 
 
-def test_pose_errors_turn_every_joint_by_the_stated_angle(room: KnownRoom) -> None:
-    bodies, _, pose = posed(noisy(room, pose=4.0).bodies)
-    both = (pose, posed(room.bodies)[2])
+def test_pose_errors_turn_every_joint_by_the_stated_angle(tiny: KnownRoom) -> None:
+    bodies, _, pose = posed(noisy(tiny, pose=4.0).bodies)
+    both = (pose, posed(tiny.bodies)[2])
     wrong, right = (axis_angle(p.body_pose.double().reshape(-1, 21, 3)) for p in both)
     step = right.mT @ wrong
     cosine = ((step.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1)
@@ -199,11 +193,11 @@ def test_slow_noise_has_variance_one_and_forgets_in_time() -> None:
         assert abs((noise[lag:] * noise[:-lag]).mean() - math.exp(-lag / 5)) < 0.06
 
 
-def test_jitter_and_dropped_rows_follow_their_configuration(room: KnownRoom) -> None:
-    bodies, _, pose = posed(noisy(room, 1, jitter=0.015, dropped=0.2).bodies)
-    kept = torch.isin(room.bodies.frame, bodies.frame)
+def test_jitter_and_dropped_rows_follow_their_configuration(tiny: KnownRoom) -> None:
+    bodies, _, pose = posed(noisy(tiny, 1, jitter=0.015, dropped=0.2).bodies)
+    kept = torch.isin(tiny.bodies.frame, bodies.frame)
     assert 0.05 < 1 - float(kept.float().mean()) < 0.35
-    shift = (bodies.verts - room.bodies.verts[kept])[:, 0]
+    shift = (bodies.verts - tiny.bodies.verts[kept])[:, 0]
     assert abs(float(shift.std()) - 0.015) < 0.002
     assert len(pose.transl) == len(bodies.frame)
 
@@ -220,11 +214,11 @@ def test_masks_grow_and_shrink_by_whole_pixels() -> None:
 
 
 def test_people_masks_are_off_by_at_most_the_stated_pixels_and_some_are_missed(
-    room: KnownRoom,
+    tiny: KnownRoom,
 ) -> None:
     from scipy.ndimage import distance_transform_edt
 
-    people, true = noisy(room, person_masks=3, missed_masks=0.25).people, room.capture.people
+    people, true = noisy(tiny, person_masks=3, missed_masks=0.25).people, tiny.capture.people
     assert isinstance(people, People)
     assert isinstance(true, People)
     assert 0.1 < 1 - len(people.frame) / len(true.frame) < 0.4
@@ -236,7 +230,7 @@ def test_people_masks_are_off_by_at_most_the_stated_pixels_and_some_are_missed(
         assert np.asarray(distance_transform_edt(b))[lost].max(initial=0) <= 3
 
 
-def test_a_leak_adds_one_disc_at_the_border(room: KnownRoom) -> None:
+def test_a_leak_adds_one_disc_at_the_border(tiny: KnownRoom) -> None:
     mask = np.zeros((60, 90), dtype=bool)
     mask[20:40, 30:60] = True
     for where in (0.0, 0.4, 0.99):
@@ -246,12 +240,12 @@ def test_a_leak_adds_one_disc_at_the_border(room: KnownRoom) -> None:
         reach = 0.2 * math.sqrt(mask.sum())
         assert 0.3 * math.pi * reach**2 < extra.sum() < math.pi * reach**2
         assert max(np.ptp(rows), np.ptp(cols)) <= 2 * reach + 1
-    for given, true in zip(noisy(room, leaks=1.0).detections, room.capture.detections, strict=True):
+    for given, true in zip(noisy(tiny, leaks=1.0).detections, tiny.capture.detections, strict=True):
         assert shown(given).sum() > shown(true).sum()
 
 
-def test_detections_and_pieces_are_missed_and_invented_together(room: KnownRoom) -> None:
-    light = _light(room)
+def test_detections_and_pieces_are_missed_and_invented_together(tiny: KnownRoom) -> None:
+    light = _light(tiny)
     missed = invented = 0
     for seed in range(40):
         capture = noisy(light, seed, missed=0.3, false=0.2)
@@ -262,7 +256,7 @@ def test_detections_and_pieces_are_missed_and_invented_together(room: KnownRoom)
             one = found[piece.annotation or 0]
             assert one.category == piece.category
             assert float((one.box[2:] - one.box[:2]).min()) >= 1
-        real = {p.id for p in capture.scene.objects} & {p.id for p in room.truth.objects}
+        real = {p.id for p in capture.scene.objects} & {p.id for p in tiny.truth.objects}
         missed += 3 - len(real)
         invented += len(capture.scene.objects) - len(real)
         assert all(p.id in real or p.id.startswith("false_") for p in capture.scene.objects)
@@ -270,9 +264,9 @@ def test_detections_and_pieces_are_missed_and_invented_together(room: KnownRoom)
     assert abs(invented / (120 - missed) - 0.2) < 0.12
 
 
-def test_merged_masks_are_the_union_of_two_and_one_object_is_missing(room: KnownRoom) -> None:
-    capture = noisy(room, merged=1.0)
-    true = {d.id: shown(d) for d in room.capture.detections}
+def test_merged_masks_are_the_union_of_two_and_one_object_is_missing(tiny: KnownRoom) -> None:
+    capture = noisy(tiny, merged=1.0)
+    true = {d.id: shown(d) for d in tiny.capture.detections}
     left = {d.id: shown(d) for d in capture.detections}
     assert len(left) == len(capture.detections) < len(true)
     assert {p.annotation for p in capture.scene.objects} == set(left)

@@ -8,6 +8,7 @@ import pytest
 import torch
 from figures import ARMS_DOWN, SEATED, STRIDE, moving, people, pose, turned
 from little_room import GROUND, camera, room
+from test_pipeline import light
 
 from mover.bodies.parts import members, parts_of
 from mover.bodies.posture import touching
@@ -27,7 +28,6 @@ from mover.geometry.boxes import box_of
 from mover.geometry.placement import place_object
 from mover.geometry.rotations import rot_y
 from mover.io.capture.scene_file import read_scene
-from mover.pipeline.presets import ROBUST
 from mover.stages.masks import small_camera
 from mover_bench.experiment.job import noisy_room
 from mover_bench.experiment.sets import SETS
@@ -205,8 +205,9 @@ def test_an_id_that_is_taken_is_not_given_again():
 @pytest.mark.slow
 def test_what_a_run_proposes_changes_nothing_else_of_its_room(tmp_path: Path):
     capture = noisy_room(103, replace(SETS["mini"], withheld="seat")).capture
-    run, without = Run(tmp_path), replace(ROBUST, propose_seats=False)
-    with_it, bare = (reconstruct(capture, config, run) for config in (ROBUST, without))
+    run, config = Run(tmp_path), light("robust")
+    without = replace(config, propose_seats=False)
+    with_it, bare = (reconstruct(capture, one, run) for one in (config, without))
     assert [one.piece for one in with_it.proposals] != []
     assert bare.proposals == ()
     said = tuple(line for line in with_it.warnings if "is proposed there" not in line)
@@ -215,5 +216,5 @@ def test_what_a_run_proposes_changes_nothing_else_of_its_room(tmp_path: Path):
     first, *others = bare.scene.objects
     stays = tuple(Segment(n, p.t_world_object, p.yaw) for n, p in ((0, first), (9, seat)))
     scene = replace(bare.scene, objects=(replace(first, segments=stays), *others))
-    moved = with_missing_seats(replace(bare, scene=scene), capture, ROBUST, run)
+    moved = with_missing_seats(replace(bare, scene=scene), capture, config, run)
     assert seat.id not in [one.proposed.id for one in moved.proposals]

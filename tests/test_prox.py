@@ -58,6 +58,12 @@ def write_stills(root: Path, room: layouts.Room) -> Path:
     return root
 
 
+def mask_of(row: dict) -> torch.Tensor:
+    """The mask of a row of people.json."""
+    coded = row["segmentation"]
+    return decode(Masks(*coded["size"], (coded["counts"].encode(),)), 0)
+
+
 def rows_of(folder: Path) -> dict[str, dict]:
     return json.loads((folder / "people.json").read_text())
 
@@ -114,13 +120,9 @@ def test_videos_follow_one_another_with_a_minute_between(
 
 def test_body_indices_are_masks_of_the_flipped_pictures(stills: Path, tmp_path: Path) -> None:
     imported("prox", stills, tmp_path / "out", tmp_path, recording=FIRST)
-    row = rows_of(tmp_path / "out")["annotations"][1]
-    height, width = row["segmentation"]["size"]
-    code = row["segmentation"]["counts"].encode()
-    found = decode(Masks(height, width, (code,)), 0)
     wanted = torch.zeros(1080, 1920, dtype=torch.bool)
     wanted[200:700, 1920 - 410 : 1920 - 310] = True
-    assert torch.equal(found, wanted)
+    assert torch.equal(mask_of(rows_of(tmp_path / "out")["annotations"][1]), wanted)
 
 
 def test_the_reference_is_the_emptiest_picture_and_who_is_in_it_is_masked(
@@ -141,11 +143,9 @@ def test_the_reference_is_the_emptiest_picture_and_who_is_in_it_is_masked(
     with Image.open(reference) as picture:
         assert np.abs(np.asarray(picture.convert("RGB"))[5, 5] - [200, 10, 10]).max() < 20
     (row,) = rows_of(tmp_path / "out")["reference_people"]
-    height, width = row["segmentation"]["size"]
-    mask = decode(Masks(height, width, (row["segmentation"]["counts"].encode(),)), 0)
     wanted = torch.zeros(1080, 1920, dtype=torch.bool)
     wanted[300:310, 1500:1520] = True
-    assert torch.equal(mask, wanted)
+    assert torch.equal(mask_of(row), wanted)
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,11 @@
 """Sets of known rooms: each keeps its promises."""
 
 from dataclasses import replace
+from itertools import combinations
 
 import pytest
 import torch
-from test_rooms import hidden_shares, shared_room
+from test_rooms import hidden_shares
 
 from mover.core.records import fingerprint
 from mover.core.types import SceneObject
@@ -13,13 +14,9 @@ from mover.geometry.placement import placed_at
 from mover_bench.experiment.job import true_room, with_noise
 from mover_bench.experiment.measures import seat_height
 from mover_bench.experiment.sets import SETS, parse_seeds
+from mover_bench.rooms.compose import overlap
 from mover_bench.rooms.config import NoiseConfig, RoomConfig
 from mover_bench.rooms.known import KnownRoom, make_room
-
-
-@pytest.fixture(scope="module")
-def tiny() -> KnownRoom:
-    return shared_room()
 
 
 def test_small_room_is_what_it_was_before_there_were_sets(small_room: KnownRoom) -> None:
@@ -75,6 +72,16 @@ def by_id(things: tuple[SceneObject, ...]) -> dict[str, SceneObject]:
     return {thing.id: thing for thing in things}
 
 
+def is_rich_and_free_of_overlap(room: KnownRoom, people: int) -> None:
+    assert 6 <= len(room.truth.objects) <= 9
+    assert int(room.bodies.frame.max()) + 1 >= 200
+    assert set(room.bodies.person.tolist()) == set(range(people))
+    ground = room.truth.ground
+    assert ground is not None
+    assert not any(overlap(a, b, 0.0) for a, b in combinations(room.plan.pieces, 2))
+    assert all(abs(float(p.t_world_object[1]) - ground) < 1e-6 for p in room.truth.objects)
+
+
 @pytest.fixture(scope="module")
 def standard() -> KnownRoom:
     """A held-out room of `rooms`, which other sets share."""
@@ -94,7 +101,7 @@ class TestPromises:
 
     def test_in_two_there_are_two_who_do_not_run_into_each_other(self) -> None:
         room = make_room(1003, SETS["two"].room)
-        assert set(room.bodies.person.tolist()) == {0, 1}
+        is_rich_and_free_of_overlap(room, 2)
         assert room.bodies.joints is not None
         keys = zip(room.bodies.frame.tolist(), room.bodies.person.tolist(), strict=True)
         places = dict(zip(keys, room.bodies.joints[:, 0], strict=True))
@@ -144,8 +151,7 @@ class TestPromises:
     def test_rooms_are_used_and_their_noise_is_that_of_their_set(self, standard: KnownRoom) -> None:
         room = standard
         true = by_id(room.truth.objects)
-        assert 6 <= len(true) <= 9
-        assert int(room.bodies.frame.max()) + 1 >= 200
+        is_rich_and_free_of_overlap(room, 1)
         assert len(furniture_in_use(room)) >= 3
         shapes = with_noise(room, 1000, SETS["wrong-shape"])
         for name, thing in by_id(shapes.capture.scene.objects).items():

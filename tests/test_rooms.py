@@ -1,7 +1,6 @@
 """Known rooms: people walk on planted feet, sit on seats, and masks are what the camera sees."""
 
 import dataclasses
-import functools
 import itertools
 
 import igl
@@ -17,7 +16,7 @@ from mover.geometry.camera import to_world
 from mover.geometry.placement import place_object
 from mover.geometry.rle import decode
 from mover_bench.experiment.sets import SETS
-from mover_bench.rooms.compose import Plan, draw_plan, make_view, overlap
+from mover_bench.rooms.compose import Plan, draw_plan, make_view
 from mover_bench.rooms.config import RoomConfig
 from mover_bench.rooms.gait import duration, stations, walk
 from mover_bench.rooms.known import Actor, KnownRoom, build, make_room
@@ -198,17 +197,6 @@ def tiny_room() -> KnownRoom:
     return build(plan, (Actor(stage, acts),), config, "tiny", acts.refused)
 
 
-@functools.cache
-def shared_room() -> KnownRoom:
-    """The tiny room, made once for all files of tests."""
-    return tiny_room()
-
-
-@pytest.fixture(scope="module")
-def tiny() -> KnownRoom:
-    return shared_room()
-
-
 def test_masks_are_what_an_independent_ray_caster_sees(tiny: KnownRoom) -> None:
     meshes = [place_object(p) for p in tiny.truth.objects]
     seen = draw([(m.verts.numpy(), m.faces.numpy()) for m in meshes], tiny.truth.camera)
@@ -313,21 +301,8 @@ class TestWholeRooms:
         assert {"walk", "sit", "lean", "lie", "left hand"} <= set(room.actions)
         assert len(room.truth.objects) >= 6
 
-    @pytest.mark.parametrize(("seed", "people"), [(0, 1), (21, 2)])
-    def test_drawn_rooms_are_rich_and_free_of_overlap(self, seed: int, people: int) -> None:
-        room = make_room(seed, RoomConfig(people=people))
-        assert 6 <= len(room.truth.objects) <= 9
-        assert int(room.bodies.frame.max()) + 1 >= 200
-        assert len(set(room.bodies.person.tolist())) == people
-        ground = room.truth.ground
-        assert ground is not None
-        pairs = itertools.combinations(room.plan.pieces, 2)
-        assert not any(overlap(a, b, 0.0) for a, b in pairs)
-        assert all(abs(float(p.t_world_object[1]) - ground) < 1e-6 for p in room.truth.objects)
-
-    @pytest.mark.parametrize("people", [1, 2])
-    def test_drawn_rooms_are_repeatable_and_not_each_other(self, people: int) -> None:
-        config = dataclasses.replace(SETS["mini"].room, people=people, pieces=6, least_pieces=4)
+    def test_drawn_rooms_are_repeatable_and_not_each_other(self) -> None:
+        config = dataclasses.replace(SETS["mini"].room, people=2, pieces=6, least_pieces=4)
         one, again, other = (make_room(seed, config) for seed in (7, 7, 8))
         assert fingerprint(one) == fingerprint(again)
         assert not torch.equal(one.bodies.verts[0], other.bodies.verts[0])

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 from test_noise import noisy, pairs, posed, shown, size
-from test_rooms import shared_room
 
 from mover.bodies.skinning import open_body
 from mover.core.types import SceneObject
@@ -19,11 +18,6 @@ from mover_bench.rooms.foreign import MAKERS, foreign_mesh
 from mover_bench.rooms.known import KnownRoom
 from mover_bench.rooms.noise import add_noise
 from mover_bench.rooms.noise_masks import coarse, wobbled
-
-
-@pytest.fixture(scope="module")
-def room() -> KnownRoom:
-    return shared_room()
 
 
 @pytest.mark.parametrize("maker", MAKERS, ids=lambda m: m.__name__.strip("_"))
@@ -70,53 +64,53 @@ def test_an_outline_wobbles_by_the_stated_pixels() -> None:
     assert abs(np.mean(off)) < 1.0
 
 
-def test_amodal_masks_hold_what_is_hidden(room: KnownRoom) -> None:
-    both = zip(noisy(room, amodal=1.0).detections, room.capture.detections, strict=True)
+def test_amodal_masks_hold_what_is_hidden(tiny: KnownRoom) -> None:
+    both = zip(noisy(tiny, amodal=1.0).detections, tiny.capture.detections, strict=True)
     grown = [int(shown(a).sum()) - int(shown(b).sum()) for a, b in both]
     assert min(grown) >= 0
     assert max(grown) > 0
 
 
-def test_mean_bodies_have_one_shape_and_fill_their_pictures(room: KnownRoom) -> None:
-    given, _, pose = posed(noisy(room, mean_bodies=True).bodies)
+def test_mean_bodies_have_one_shape_and_fill_their_pictures(tiny: KnownRoom) -> None:
+    given, _, pose = posed(noisy(tiny, mean_bodies=True).bodies)
     assert float(pose.betas.abs().max()) == 0
 
     def height(verts: torch.Tensor) -> torch.Tensor:
-        pixel = project(verts, room.truth.camera.K)[..., 1]
+        pixel = project(verts, tiny.truth.camera.K)[..., 1]
         return pixel.amax(-1) - pixel.amin(-1)
 
-    share = height(given.verts) / height(room.bodies.verts)
+    share = height(given.verts) / height(tiny.bodies.verts)
     assert 0.93 < float(share.median()) < 1.07
     assert open_body().posed(pose)[0].sub(given.verts).abs().max() < 1e-4
 
 
-def test_a_biased_pose_stays_biased(room: KnownRoom) -> None:
-    given, true = (posed(b)[2] for b in (noisy(room, pose_bias=6.0).bodies, room.bodies))
+def test_a_biased_pose_stays_biased(tiny: KnownRoom) -> None:
+    given, true = (posed(b)[2] for b in (noisy(tiny, pose_bias=6.0).bodies, tiny.bodies))
     off = given.body_pose - true.body_pose
     assert float(off.mean(0).abs().mean()) > 3 * float(off.std(0).median())
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_wrong_lens_keeps_the_picture_and_the_widths(room: KnownRoom, seed: int) -> None:
-    capture = noisy(room, seed, lens=0.055)
-    zoom = float(capture.scene.camera.K[0, 0] / room.truth.camera.K[0, 0])
+def test_a_wrong_lens_keeps_the_picture_and_the_widths(tiny: KnownRoom, seed: int) -> None:
+    capture = noisy(tiny, seed, lens=0.055)
+    zoom = float(capture.scene.camera.K[0, 0] / tiny.truth.camera.K[0, 0])
     assert 0.029 < abs(zoom - 1) < 0.081
 
     def seen(piece: SceneObject, K: torch.Tensor) -> torch.Tensor:
-        return project(to_camera(box_of(piece).center, room.truth.camera.R_cam_world), K)
+        return project(to_camera(box_of(piece).center, tiny.truth.camera.R_cam_world), K)
 
-    for given, true in pairs(room, capture):
+    for given, true in pairs(tiny, capture):
         assert torch.allclose(size(given), size(true), atol=1e-5)
-        pixels = seen(given, capture.scene.camera.K), seen(true, room.truth.camera.K)
+        pixels = seen(given, capture.scene.camera.K), seen(true, tiny.truth.camera.K)
         assert torch.allclose(*pixels, atol=0.05)
-    given, true = (posed(b)[1] for b in (capture.bodies, room.bodies))
+    given, true = (posed(b)[1] for b in (capture.bodies, tiny.bodies))
     assert torch.allclose(given[:, 0, 2], true[:, 0, 2] * zoom, atol=1e-3)
     assert torch.allclose(given[..., :2], true[..., :2], atol=1e-4)
 
 
-def test_the_other_sets_do_not_change(room: KnownRoom) -> None:
+def test_the_other_sets_do_not_change(tiny: KnownRoom) -> None:
     """New errors have streams of their own."""
-    plain, lens = add_noise(room, NoiseConfig(), 3), add_noise(room, NoiseConfig(lens=0.05), 3)
+    plain, lens = add_noise(tiny, NoiseConfig(), 3), add_noise(tiny, NoiseConfig(lens=0.05), 3)
     assert [p.yaw for p in plain.scene.objects] == [p.yaw for p in lens.scene.objects]
     assert plain.detections == lens.detections or all(
         torch.equal(a.box, b.box) for a, b in zip(plain.detections, lens.detections, strict=True)
