@@ -81,8 +81,8 @@ def _foot(points: Float[Tensor, "bodies sole 3"]) -> Float[Tensor, "bodies 3"]:
 class _Chain:
     """Least squares for a vector in each row: unknowns, pairs of them, and their sum."""
 
-    def __init__(self, rows: int) -> None:
-        self.rows = rows
+    def __init__(self, rows: int, near: Neighbours) -> None:
+        self.rows, self.near = rows, near
         self.entries: list[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]] = []
         self.right = np.zeros((rows, 3))
 
@@ -92,18 +92,40 @@ class _Chain:
         self._blocks(np.arange(self.rows), np.arange(self.rows), blocks)
         self.right += np.einsum("rij,rj->ri", blocks, goal.numpy())
 
-    def pairs(
-        self,
-        pairs: Int[Tensor, "pairs 2"],
-        at: Float[Tensor, "pairs 3"],
-        goal: Float[Tensor, "pairs 3"],
+    def slow(self, change: float) -> None:
+        """What is sought changes by so much [m/√s]."""
+        weight = 1 / (change**2 * self.near.gaps.double())
+        self._pairs(weight, 1.0, torch.zeros(len(weight), 3, dtype=torch.float64))
+
+    def still(
+        self, places: Float[Tensor, "rows 3"], chance: Float[Tensor, " rows"], slip: float,
+        up: float = 0.0,
+    ) -> None:  # fmt: skip
+        """Places [m] that move with the rows rest, by a chance, along the floor and `up`wards."""
+        i, j = self.near.pairs.unbind(-1)
+        weight = torch.minimum(chance[i], chance[j]) / slip**2
+        self._pairs(weight, up, -(places[j] - places[i]))
+
+    def on_floor(
+        self, foot: Float[Tensor, "rows 3"], rest: Float[Tensor, " rows"], floor: float, rise: float
+    ) -> None:
+        """A sole at rest near the floor lies on it, and none is below it."""
+        height = foot[:, 1] - floor
+        share = torch.where(height < 0, torch.ones_like(rest), rest * (height < ON_FLOOR))
+        at, goal = foot.new_zeros(len(foot), 3, 3), torch.zeros_like(foot)
+        at[:, 1, 1], goal[:, 1] = share / rise**2, -height
+        self.prior(at, goal)
+
+    def _pairs(
+        self, weight: Float[Tensor, " pairs"], up: float, goal: Float[Tensor, "pairs 3"]
     ) -> None:
         """Add (x_j - x_i - goal)ᵀ diag(a) (x_j - x_i - goal) of each pair."""
-        i, j = pairs.numpy().T
-        blocks = np.einsum("pi,ij->pij", at.numpy(), np.eye(3))
+        at = torch.stack([weight, up * weight, weight], -1).numpy()
+        i, j = self.near.pairs.numpy().T
+        blocks = np.einsum("pi,ij->pij", at, np.eye(3))
         for a, b, sign in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
             self._blocks(a, b, sign * blocks)
-        pull = at.numpy() * goal.numpy()
+        pull = at * goal.numpy()
         np.add.at(self.right, j, pull)
         np.add.at(self.right, i, -pull)
 
@@ -126,16 +148,6 @@ class _Chain:
         return torch.from_numpy(np.asarray(found).reshape(self.rows, 3))
 
 
-def _both(values: Float[Tensor, " rows"], pairs: Int[Tensor, "pairs 2"]) -> Float[Tensor, " pairs"]:
-    """What is true of both rows of a pair."""
-    return torch.minimum(values[pairs[:, 0]], values[pairs[:, 1]])
-
-
-def _level(weight: Tensor, up: float = 0.0) -> Tensor:
-    """A weight along the floor, and a share of it upwards."""
-    return torch.stack([weight, up * weight, weight], -1)
-
-
 def _shifts(
     bodies: Bodies,
     near: Neighbours,
@@ -145,38 +157,21 @@ def _shifts(
     floor: float,
 ) -> Float[Tensor, "bodies 3"]:
     """How far each body is moved as a whole [m]."""
-    chain, pairs = _Chain(len(bodies.frame)), near.pairs
-    sway = SWAY if bodies.pose is not None else RIGID
+    chain, sway = _Chain(len(bodies.frame), near), SWAY if bodies.pose is not None else RIGID
     middle = bodies.verts.double().mean(1)
     x, _, z = middle.unbind(-1)
     side = torch.stack([z, torch.zeros_like(z), -x], -1)
     side = side / side.norm(dim=-1, keepdim=True).clamp_min(1e-6)
     across = side[:, :, None] * side[:, None]
     prior = (torch.eye(3, dtype=torch.float64) - across) / ALONG**2 + across / ACROSS**2
-    nothing = torch.zeros(len(pairs), 3, dtype=torch.float64)
-    chain.pairs(pairs, _level(1 / (STEADY**2 * near.gaps.double()), 1.0), nothing)
+    chain.slow(STEADY)
     chain.prior(prior, torch.zeros_like(middle))
     for k, sole in enumerate(soles):
         foot = _foot(bodies.verts[:, sole])
-        way = foot[pairs[:, 1]] - foot[pairs[:, 0]]
-        chain.pairs(pairs, _level(_both(rest[:, k], pairs) / sway**2), -way)
-        chain.prior(*_floor(foot, rest[:, k], floor, SINK))
-    way = middle[pairs[:, 1]] - middle[pairs[:, 0]]
-    chain.pairs(pairs, _level(_both(calm, pairs) / STILL**2, 1.0), -way)
+        chain.still(foot, rest[:, k], sway)
+        chain.on_floor(foot, rest[:, k], floor, SINK)
+    chain.still(middle, calm, STILL, up=1.0)
     return chain.solve()
-
-
-def _floor(
-    foot: Float[Tensor, "bodies 3"], rest: Float[Tensor, " bodies"], floor: float, rise: float
-) -> tuple[Float[Tensor, "bodies 3 3"], Float[Tensor, "bodies 3"]]:
-    """A sole at rest near the floor lies on it, and none is below it."""
-    height = foot[:, 1] - floor
-    share = torch.where(height < 0, torch.ones_like(rest), rest * (height < ON_FLOOR))
-    at = torch.zeros(len(foot), 3, 3, dtype=torch.float64)
-    at[:, 1, 1] = share / rise**2
-    goal = torch.zeros(len(foot), 3, dtype=torch.float64)
-    goal[:, 1] = -height
-    return at, goal
 
 
 def _way(
@@ -186,15 +181,13 @@ def _way(
     floor: float,
 ) -> Float[Tensor, "bodies 3"]:
     """How far a foot has to go beside its body [m]."""
-    foot, pairs = _foot(points), near.pairs
-    chain = _Chain(len(foot))
+    foot = _foot(points)
+    chain = _Chain(len(foot), near)
     eye = torch.eye(3, dtype=torch.float64).expand(len(foot), 3, 3)
     chain.prior(eye / FOOT**2, torch.zeros_like(foot))
-    nothing = torch.zeros(len(pairs), 3, dtype=torch.float64)
-    chain.pairs(pairs, _level(1 / (FADE**2 * near.gaps.double()), 1.0), nothing)
-    way = foot[pairs[:, 1]] - foot[pairs[:, 0]]
-    chain.pairs(pairs, _level(_both(rest, pairs) / SLIP**2), -way)
-    chain.prior(*_floor(foot, rest, floor, RISE))
+    chain.slow(FADE)
+    chain.still(foot, rest, SLIP)
+    chain.on_floor(foot, rest, floor, RISE)
     return chain.solve()
 
 
