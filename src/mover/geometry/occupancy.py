@@ -1,10 +1,9 @@
 """A closed mesh from an Occupancy Network for point clouds (Mescheder et al., CVPR 2019).
 
-The paper closes the meshes of its detector with it. The parameters have the names and shapes of
-the authors' checkpoints (`onet_pcl2mesh`), so that a published file loads by its keys; widths are
-read off the file. Encoder: a ResNet-PointNet. Decoder: five residual blocks whose batch norms take
-scale and shift from the shape's code. The surface is found by multiresolution extraction and
-marching cubes.
+The paper closes the meshes of its detector with it. The authors' checkpoints (`onet_pcl2mesh`) load
+by their keys; widths are read off the file. Encoder: a ResNet-PointNet. Decoder: five residual
+blocks whose batch norms take scale and shift from the shape's code. The surface is found by
+multiresolution extraction and marching cubes.
 """
 
 import re
@@ -164,8 +163,13 @@ def refined(field: Inside, config: ExtractConfig) -> Float[Tensor, "n n n"]:
     was taken for uniform, its corners are evaluated, too, until nothing changes: what hangs
     together with anything found is found wholly.
     """
+
+    def evaluated(index: Int[Tensor, "points 3"], cells: int) -> Float[Tensor, " points"]:
+        points = index.float() * (PADDING / cells) - PADDING / 2
+        return torch.cat([field(part) for part in points.split(AT_ONCE)])
+
     cells, axis = config.coarse, torch.arange(config.coarse + 1)
-    values = _evaluated(field, torch.cartesian_prod(axis, axis, axis), cells)
+    values = evaluated(torch.cartesian_prod(axis, axis, axis), cells)
     values = values.reshape(cells + 1, cells + 1, cells + 1)
     for _ in range(config.levels):
         split = _mixed(values)
@@ -179,18 +183,10 @@ def refined(field: Inside, config: ExtractConfig) -> Float[Tensor, "n n n"]:
         known[::2, ::2, ::2] = True
         wanted = _corners(split) & ~known
         while bool(wanted.any()):
-            values[wanted] = _evaluated(field, wanted.nonzero(), cells)
+            values[wanted] = evaluated(wanted.nonzero(), cells)
             known = known | wanted
             wanted = _corners(_mixed(values)) & ~known
     return values
-
-
-def _evaluated(
-    field: Inside, index: Int[Tensor, "points 3"], cells: int
-) -> Float[Tensor, " points"]:
-    """The field at grid points."""
-    points = index.float() * (PADDING / cells) - PADDING / 2
-    return torch.cat([field(part) for part in points.split(AT_ONCE)])
 
 
 def _mixed(values: Float[Tensor, "n n n"]) -> Bool[Tensor, "m m m"]:
@@ -210,8 +206,8 @@ def occupied_mesh(
 ) -> Mesh:
     """What the network makes of a mesh: closed, in the same box.
 
-    The points that it sees are spread evenly over the surface, in the axes and the size of its
-    training data (ShapeNet's: our x and z change places, the longest side is one).
+    It sees even points of the surface in the axes and the size of its training data (ShapeNet's:
+    our x and z change places, the longest side is one).
 
     Raises:
         ValueError: If the network finds nothing inside.
