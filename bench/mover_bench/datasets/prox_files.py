@@ -33,13 +33,11 @@ SCENES = (
 """The ten scenes on which the paper measures."""
 BOOTHS = ("BasementSittingBooth", "N0SittingBooth")
 """Left out: a bench and its table that cannot be distinguished."""
-VIDEOS, SHOTS = 51, 178
-"""Recordings of the ten scenes, and frames of the quantitative part."""
+VIDEOS, SHOTS = 51, 178  #: recordings of the ten scenes, and frames of the quantitative part
 QUANTITATIVE = "vicon"
 FEMALE = ("162", "3452", "159", "03403", "3403")
 """Subjects whose fits are of the female model; all others are male."""
-Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-"""The scans' z up -> +y up."""
+Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  #: the scans' z up -> +y up
 PAUSE = 60.0  # [s] between two videos of one capture: no person is tracked across it
 FITS = ("PROXD", "PROX", "fittings/PROXD", "fittings/PROX", "fittings/RGB")
 """Where fitted bodies may lie; the first that is there counts."""

@@ -17,10 +17,8 @@ from mover_bench.experiment.sets import parse_seeds, set_named
 from mover_bench.experiment.tables import LOG, read_finished, write_tables
 from mover_bench.experiment.variants import names_in
 
-Jobs = Sequence[tuple[Sequence[str], Path]]
-"""The words of each, and the file of what it says."""
-Pool = Callable[[str, Jobs, int], Iterator[int]]
-"""`run_each`, or what does the same another way."""
+Jobs = Sequence[tuple[Sequence[str], Path]]  #: the words of each, and the file of what it says
+Pool = Callable[[str, Jobs, int], Iterator[int]]  #: `run_each`, or what does the same another way
 THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 

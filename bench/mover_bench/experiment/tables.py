@@ -24,8 +24,7 @@ from mover_bench.experiment.job import path_of
 from mover_bench.experiment.sets import set_named
 from mover_bench.experiment.variants import VARIANTS
 
-Frame = Any
-"""A `pandas.DataFrame`."""
+Frame = Any  #: a `pandas.DataFrame`
 LOG = "log.txt"
 STAGES = ("initial", "image", "full")
 RESAMPLES, LEVEL = 10_000, 0.95

@@ -18,10 +18,8 @@ Given = Literal["all", "no contact", "no people"]
 SEGMENTS = 10  # of each length, as in the paper
 LENGTHS = (10, 20, 30)  # [s]
 FRAMES = 5  # single frames whose results are averaged
-TERMS = ("contact", "depth", "collision")
-"""The terms of the people as the paper has them."""
-NO_TERM = "no-term"
-"""Stands for none of them: the image alone, optimised once more."""
+TERMS = ("contact", "depth", "collision")  #: the terms of the people as the paper has them
+NO_TERM = "no-term"  #: stands for none of them: the image alone, optimised once more
 
 
 @dataclass(frozen=True)

@@ -138,5 +138,4 @@ def _soup(mesh: Triangles, rng: np.random.Generator) -> Triangles:
     return np.asarray(verts), np.concatenate([faces, twice[:, ::-1]])
 
 
-MAKERS = (_smooth, _blocky, _sphere, _soup)
-"""The ways in which other programs make a mesh."""
+MAKERS = (_smooth, _blocky, _sphere, _soup)  #: the ways in which other programs make a mesh

@@ -207,8 +207,7 @@ def _resolidified(small: Mesh, mesh: Mesh) -> Mesh | None:
     return used(Mesh(verts.to(mesh.verts), faces.to(mesh.faces)))
 
 
-simplifying = Lock()
-"""Held while fast_simplification works: on global variables."""
+simplifying = Lock()  #: held while fast_simplification works: on global variables
 
 
 def farthest_first(points: Float[Tensor, "points 3"], count: int) -> Int[Tensor, " count"]:

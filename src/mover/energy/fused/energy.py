@@ -9,8 +9,7 @@ from torch import Tensor
 from mover.core.observe import Energy
 from mover.core.types import Camera, Layout, Objects
 from mover.energy.config import SceneConfig
-from mover.energy.fused.launch import FUSED, FusedEnergy, fused_cost
-from mover.energy.fused.pack import kernel_of, real_parts
+from mover.energy.fused.launch import FUSED, FusedEnergy, fused_cost, kernel_of, real_parts
 from mover.energy.objective import (
     SCENE_TERMS,
     HumanCues,
