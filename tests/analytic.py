@@ -108,7 +108,7 @@ def given_at(layout):
 
 
 def walls_at(objects, layout):
-    """A line along the rear of each object, which tells the others little."""
+    """A line along the rear of each object, which constrains the others little."""
     rears = rears_of(layout, objects.size)
     trust = 0.2 + 0.7 * torch.eye(len(objects.ids)).to(rears.out)
     return Walls(rears.out, (rears.ends.mean(-2) * rears.out).sum(-1), trust)

@@ -9,7 +9,7 @@ torch.set_num_threads(1)  # threads that wait for one another are slower than on
 
 
 class _Kernels(PathFinder):
-    """Kernels are read by Warp, which has types of its own: nobody checks them."""
+    """Kernels are read by Warp, which has types of its own: they are not checked."""
 
     @classmethod
     def find_spec(cls, fullname, path=None, target=None):

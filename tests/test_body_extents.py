@@ -53,18 +53,12 @@ def compared(bodies, seen, objects=NO_PEOPLE):
     return compare_extents(bodies, rows, CAMERA, table, covered(Cover(objects)))
 
 
-def observed(*given):
-    found = compared(*given)
-    assert found is not None
-    return found
-
-
 @pytest.mark.parametrize("pixels", [-2, 0, 1])
 @pytest.mark.parametrize("bias", [1.02, 0.98])
 def test_bodies_at_a_wrong_depth_are_found_whatever_the_width_of_the_masks(bias, pixels):
     true = upright()
     seen = masks_of(true)
-    found = observed(moved(true, bias), wider(seen, pixels) if pixels else seen)
+    found = compared(moved(true, bias), wider(seen, pixels) if pixels else seen)
     assert found.frames == 6
     assert found.factor == pytest.approx(1 / bias, abs=0.005)
     assert found.spread < 0.005
@@ -87,7 +81,7 @@ def test_people_whom_objects_or_others_hide_are_left_out():
 def test_an_object_behind_a_person_hides_no_one():
     true = upright()
     wall = torch.ones(SIZE, dtype=torch.bool)
-    found = observed(true, masks_of(true), Masks(*SIZE, (encode(wall),)))
+    found = compared(true, masks_of(true), Masks(*SIZE, (encode(wall),)))
     assert found.factor == pytest.approx(1.0, abs=1e-9)
 
 
@@ -114,7 +108,7 @@ def test_bent_people_are_left_out_and_the_others_count():
     both = bodies_of([pose(UPRIGHT)] * 3 + bent)
     wrong = moved(both, 1.02)
     seen = masks_of(both)
-    found = observed(wrong, seen)
+    found = compared(wrong, seen)
     assert found.frames == 3
     assert found.factor == pytest.approx(1 / 1.02, abs=0.005)
 
@@ -125,7 +119,7 @@ def test_some_wrong_masks_do_not_move_the_factor():
     small = torch.zeros(SIZE, dtype=torch.bool)
     small[100:220, 300:330] = True
     counts = (encode(small),) * 2 + seen.masks.counts[2:]
-    found = observed(true, dataclasses.replace(seen, masks=Masks(*SIZE, counts)))
+    found = compared(true, dataclasses.replace(seen, masks=Masks(*SIZE, counts)))
     assert found.frames == 7
     assert found.factor == pytest.approx(1.0, abs=1e-9)
 

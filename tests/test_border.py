@@ -99,7 +99,6 @@ class TestTerm:
         inputs = loosened(make_inputs(size=64))
         layout = several(inputs.starts, 4)
         image = inputs.image
-        assert image.borders is not None
         found = scene_energy(layout, *rest_of(inputs), ROBUSTLY).parts
         number = best_borders(layout, inputs.objects, inputs.camera, image, WEIGHTS)
         each = []
@@ -164,8 +163,6 @@ class TestParts:
         inputs = loosened(make_inputs(size=64))
         image = replace(inputs.image, walls=walls_at(inputs.objects, inputs.starts[0]))
         small = coarser_image(image, 4)
-        assert image.borders is not None
-        assert small.borders is not None
         same = small.borders.masks[SHIFTS.index(0.0)]
         torch.testing.assert_close(same, small.masks, rtol=0, atol=1e-6)
         torch.testing.assert_close(
@@ -196,7 +193,6 @@ class TestFixed:
         sizes = torch.tensor([-0.04, 0.0, 0.04])[:, None].expand(-1, 3)
         one = replace(one, log_scale=sizes.contiguous())
         image = inputs.image
-        assert image.borders is not None
         number = best_borders(one, inputs.objects, inputs.camera, image, WEIGHTS)
         found = fixed_borders(image, one, inputs.objects, inputs.camera, WEIGHTS)
         assert found.borders is None

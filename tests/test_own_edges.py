@@ -55,7 +55,7 @@ def off(yaw: Tensor, true: float) -> Tensor:
 
 @pytest.mark.parametrize("yaw", [0.0, 0.3, 0.7, 1.0, -0.5])
 @pytest.mark.parametrize("pitch", [0.1, 0.35])
-def test_level_edges_of_a_box_tell_its_yaw_and_upright_ones_nothing(yaw: float, pitch: float):
+def test_level_edges_of_a_box_give_its_yaw_and_upright_ones_nothing(yaw: float, pitch: float):
     view = camera(pitch)
     ends = ends_of(yaw, (0.9, -1.4, -4.0), view)
     found = own_edges(segments_of(ends), EVERYWHERE, NOWHERE, view)
@@ -124,7 +124,7 @@ def test_of_things_whose_edges_agree_their_own_axis_counts_else_the_rooms():
         assert getattr(given, name)[1] == getattr(room, name)[1]
 
 
-def test_one_edge_that_the_room_contradicts_is_not_believed():
+def test_one_edge_that_the_room_contradicts_is_outvoted():
     view = camera()
     one = segments_of(ends_of(0.6, (0.9, -1.4, -4.0), view)[:1], 0.02)
     edges = own_edges(one, EVERYWHERE, NOWHERE, view)
@@ -136,7 +136,6 @@ def test_one_edge_that_the_room_contradicts_is_not_believed():
 def test_the_slats_of_a_photographed_bench_agree():
     capture = read_capture(PHOTO)
     view, seen = capture.scene.camera, image_evidence(capture)
-    assert capture.reference is not None
     segments = find_segments(capture.reference, seen.people, view.K[:2, 2], SURE)
     edges = own_edges(segments, seen.masks, seen.people, view)
     assert len(edges.yaw) >= 5

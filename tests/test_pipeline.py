@@ -156,7 +156,6 @@ class TestRun:
         placed = records.load(Placed, tmp_path / "stages" / "place_objects" / stage.fingerprint)
         energy = torch.tensor([e.energy for e in room.evidence])
         assert ((placed.energy - energy).abs().amin(0) <= 1e-3 * energy).all()  # a candidate's
-        assert placed.walls is not None
         along = placed.walls.trust.amax(-1) > 0
         assert along.any()
         for evidence, lined in zip(room.evidence, along.tolist(), strict=True):

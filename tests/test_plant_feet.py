@@ -53,8 +53,6 @@ def skate(bodies: Bodies) -> float:
 
 
 def miss(bodies: Bodies, truth: Bodies) -> float:
-    assert bodies.joints is not None
-    assert truth.joints is not None
     return float((bodies.joints - truth.joints).norm(dim=-1).mean())
 
 

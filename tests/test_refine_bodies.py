@@ -385,7 +385,7 @@ def test_people_who_touch_nothing_stay_where_they_are():
 
 
 def test_chunks_do_not_show():
-    bodies = still_people(ARMS_DOWN, 12, lift=-0.03)
+    bodies = still_people(ARMS_DOWN, 8, lift=-0.03)
     config = replace(QUICK, rounds=1, places=0, method=Adam(10))
     whole = refine_bodies(room_with(bodies), None, config)
     parts = refine_bodies(room_with(bodies), None, replace(config, rows=4, overlap=3))

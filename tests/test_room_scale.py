@@ -31,7 +31,7 @@ ROOM = 0.0
 
 
 @pytest.mark.parametrize("large", [0.93, 1.0, 1.06])
-def test_furniture_tells_how_large_the_room_is(large: float) -> None:
+def test_furniture_shows_how_large_the_room_is(large: float) -> None:
     """Sizes and places are given with errors; under people too large all is too large at once."""
     generator = torch.Generator().manual_seed(1)
     count = 9
@@ -77,25 +77,23 @@ def test_objects_that_err_together_count_as_few() -> None:
 
 
 @pytest.mark.parametrize("large", [0.94, 1.0, 1.05])
-def test_who_sits_as_high_as_people_do_tells_their_size(large: float) -> None:
+def test_the_height_of_sitters_gives_their_size(large: float) -> None:
     sitters = people(pose(SEATED, 5), fps=5.0)
     high = replace(sitters, verts=large * sitters.verts)
     usual, found = (seat_height_estimate(b, parts_of(b), ROOM) for b in (sitters, high))
-    assert usual is not None
-    assert found is not None
     assert abs(usual[0]) < 2 * usual[1]  # the open body on its own soles
     assert found[0] - usual[0] == pytest.approx(math.log(large), abs=1e-4)
     layout = somewhere(1)
     given = gather_given(boxes_of(("aquarium",), [(1.0, 1.0, 1.0)]), layout, layout, torch.ones(1))
-    told = [
+    scales = [
         common_scale(layout, given, ("aquarium",), ScaleKnown((0.0, 0.055), seats=seats))[0]
         for seats in (None, (0.05, 0.06), (0.05, 0.001))
     ]
-    assert told[0] == pytest.approx(0, abs=1e-3)
-    assert told[0] < told[1] < told[2] == pytest.approx(0.05, abs=1e-3)
+    assert scales[0] == pytest.approx(0, abs=1e-3)
+    assert scales[0] < scales[1] < scales[2] == pytest.approx(0.05, abs=1e-3)
 
 
-def test_who_stands_or_sits_on_the_floor_tells_nothing() -> None:
+def test_standing_people_and_few_sitters_give_no_size() -> None:
     standing = people(pose(ARMS_DOWN, 5), fps=5.0)
     assert seat_height_estimate(standing, parts_of(standing), ROOM) is None
     once = people(pose(SEATED, 2), fps=5.0)
@@ -108,8 +106,6 @@ def test_more_seat_height_estimate_more() -> None:
     moved[6:, :, 0] += 1.0
     two = replace(sitters, verts=moved)
     one, both = (seat_height_estimate(b, parts_of(b), ROOM) for b in (sitters, two))
-    assert one is not None
-    assert both is not None
     assert both[0] == pytest.approx(one[0], abs=1e-4)
     assert both[1] < one[1]
 
@@ -119,7 +115,6 @@ def test_a_room_of_people_of_unknown_height_says_how_uncertain_it_is(
     small_room: KnownRoom, tmp_path: Path
 ) -> None:
     known = add_noise(small_room, NoiseConfig(), 0)
-    assert known.bodies is not None
     unknown = replace(known, bodies=replace(known.bodies, size_spread=0.06))
     given = [
         [w for w in reconstruct(capture, light("robust"), Run(tmp_path)).warnings if "heights" in w]

@@ -1,4 +1,4 @@
-"""Starting: Warp is initialised once, kernels are compiled once, and both are told."""
+"""Starting: Warp is initialised once, kernels are compiled once, and both are shown."""
 
 import logging
 import os
@@ -15,9 +15,9 @@ pytest.importorskip("warp")
 
 RACE = """
 import threading, time, warp
-begun, init = [], warp.init
+calls, init = [], warp.init
 def slow():
-    begun.append(1); time.sleep(0.2); init()
+    calls.append(1); time.sleep(0.2); init()
 warp.init = slow
 from mover.geometry.warp_start import started
 folder = []
@@ -25,7 +25,7 @@ ask = lambda: folder.append(started().config.kernel_cache_dir)
 threads = [threading.Thread(target=ask) for _ in range(4)]
 for t in threads: t.start()
 for t in threads: t.join()
-assert begun == [1], begun
+assert calls == [1], calls
 assert len(set(folder)) == 1, folder
 """
 COMPILE = """
@@ -51,14 +51,14 @@ def test_threads_that_start_at_once_initialise_warp_once_and_say_nothing():
 
 
 @pytest.mark.slow
-def test_the_progress_tells_that_kernels_are_compiled_and_only_the_first_time(tmp_path):
+def test_the_progress_says_that_kernels_are_compiled_and_only_the_first_time(tmp_path):
     first, second = (said(COMPILE, WARP_CACHE_PATH=str(tmp_path)) for _ in range(2))
     assert "compiling kernels, once on this machine: lookup for cpu" in first
     assert second.strip() == "gather ..."
 
 
 def test_kernels_in_the_cache_are_loaded_without_a_word(caplog):
-    warp_start.kernels("lookup", "cpu")  # the first on this machine may tell
+    warp_start.kernels("lookup", "cpu")  # the first on this machine may say so
     warp_start._loaded.cache_clear()
     caplog.clear()
     with caplog.at_level(logging.INFO):

@@ -1,4 +1,4 @@
-"""Furniture along a wall: what a line costs, who tells it to whom, and where hidden bases end."""
+"""Furniture along a wall: what a line costs, who gives it to whom, and where hidden bases end."""
 
 import functools
 import math
@@ -119,12 +119,6 @@ def a_row(names=("cabinet", "cabinet", "cabinet", "shelf"), off=(0.0, 0.04, -0.0
     return layout_of(places, [0.0] * len(names)), objects, torch.full((len(names), 4), SEEN)
 
 
-def walls_along(*room):
-    walls = find_walls(*room)
-    assert walls is not None
-    return walls
-
-
 def naive_lines(layout, objects, sides):
     """Normal, offset and trust of each line, by loops."""
     n, able = len(objects.ids), []
@@ -175,15 +169,14 @@ class TestLines:
         if len(lines) < 2:
             assert walls is None
             return
-        assert walls is not None
         found = walls.out, walls.offset, walls.trust.mT
         for value, want in zip(found, zip(*lines, strict=True), strict=True):
             torch.testing.assert_close(value, torch.tensor(want, dtype=torch.float64))
 
-    def test_three_in_a_row_tell_it_to_one_that_is_far_off_and_hears_nothing_of_itself(self):
+    def test_three_in_a_row_give_it_to_one_that_is_far_off_and_takes_nothing_of_itself(self):
         layout, objects, sides = a_row()
         sides[3, BOTTOM] = LEAST
-        walls = walls_along(layout, objects, sides)
+        walls = find_walls(layout, objects, sides)
         torch.testing.assert_close(walls.out, torch.tensor([[0.0, -1.0]] * 4).double())
         assert walls.offset.tolist() == pytest.approx([5.0, 5.0, 5.0, 4.0])
         others = 1 - torch.eye(4).double()
@@ -192,10 +185,10 @@ class TestLines:
         others[:3, 3] = UNSEEN
         torch.testing.assert_close(walls.trust, others)
 
-    def test_one_piece_and_a_line_of_its_own_tell_nothing(self):
+    def test_one_piece_and_a_line_of_its_own_constrain_nothing(self):
         for names in (("table",), ("cabinet",), ("cabinet", "table", "bench", "chair")):
             assert find_walls(*a_row(names, [0.0] * len(names))) is None
-        walls = walls_along(*a_row(("cabinet", "shelf"), (0.0, 0.8)))
+        walls = find_walls(*a_row(("cabinet", "shelf"), (0.0, 0.8)))
         assert torch.equal(walls.trust, 1 - torch.eye(2).double())
 
 
@@ -209,7 +202,7 @@ class TestStarts:
             ("cabinet", "shelf", "table", "bed", "sofa"), (1.2 * off).tolist()
         )
         layout = replace(layout, yaw=turn)
-        walls = walls_along(layout, objects, sides)
+        walls = find_walls(layout, objects, sides)
         found = starts_at(layout, objects, walls)
         assert len(found.yaw) == 1 + len(walls.offset)
         for f in fields(Layout):
@@ -238,7 +231,7 @@ class TestStarts:
 
     def test_what_would_have_to_go_too_far_or_to_turn_too_much_stays(self):
         layout, objects, sides = a_row(("cabinet",) * 4, (0.0,) * 4)
-        walls = walls_along(layout, objects, sides)
+        walls = find_walls(layout, objects, sides)
         t, yaw = layout.t_world_object.clone(), layout.yaw.clone()
         t[0, 2] = WALL / (STRETCH[1] + 0.1)
         t[1, 2] = WALL / (STRETCH[0] - 0.05)
@@ -293,7 +286,6 @@ class TestPlacing:
             return (placed.layout.t_world_object - truth.t_world_object).norm(dim=-1)
 
         assert plain.walls is None
-        assert found.walls is not None
         assert found.walls.trust.amax(-1).tolist() == pytest.approx([1, 1, 1, 0])
         assert float(error(plain)[1]) > 0.25
         assert float(error(found)[1]) < 0.15 * float(error(plain)[1])
@@ -322,7 +314,6 @@ class TestPlacing:
         for i in (0, 2):
             assert torch.equal(placed.layout.t_world_object[i], aside.t_world_object[i])
             assert torch.equal(placed.layout.yaw[i], aside.yaw[i])
-        assert placed.walls is not None
         assert placed.walls.offset[[0, 2]].tolist() == pytest.approx([4.85, 4.85], abs=0.02)
         back = float(placed.layout.t_world_object[1, 2]) - SHELF[2] / 2
         assert back == pytest.approx(WALL + 0.15, abs=0.06)
