@@ -111,7 +111,7 @@ def take_frames(inputs: TakeInputs, config: FramesConfig, observe: Observer = si
     inputs.folder.mkdir(parents=True, exist_ok=True)
     for old in inputs.folder.glob("*.jpg"):  # of another source
         old.unlink()
-    times, numbers, indices = list[float](), list[int](), list[int]()
+    rows = list[tuple[float, int, int]]()
     size: tuple[int, int] | None = None
     fps = rate_of(inputs.source, config)
     for number, (index, time, pixels) in chosen(read_frames(inputs.source, config), config, fps):
@@ -119,22 +119,18 @@ def take_frames(inputs: TakeInputs, config: FramesConfig, observe: Observer = si
         found = picture.shape[1], picture.shape[0]
         if size is not None and found != size:
             raise InputError(
-                f"{inputs.source.name}: frame {len(times)} has {found[0]} x {found[1]} pixels, "
+                f"{inputs.source.name}: frame {len(rows)} has {found[0]} x {found[1]} pixels, "
                 f"expected {size[0]} x {size[1]} as the first"
             )
         size = found
         write_jpeg(picture, inputs.folder / f"{number:06d}.jpg")
-        observe(Step("take_frames", len(times), len(times) + 1))
-        times.append(time)
-        numbers.append(number)
-        indices.append(index)
+        observe(Step("take_frames", len(rows), len(rows) + 1))
+        rows.append((time, number, index))
     if size is None:
         raise InputError(f"{inputs.source.name}: has no frames, expected some in the chosen time")
     origin = fingerprint(inputs.stamp, str(inputs.source.resolve()), config)
-    return Clip(
-        str(inputs.folder), *size, torch.tensor(times), fps, origin, torch.tensor(numbers),
-        torch.tensor(indices),
-    )  # fmt: skip
+    times, numbers, indices = (torch.tensor(column) for column in zip(*rows, strict=True))
+    return Clip(str(inputs.folder), *size, times, fps, origin, numbers, indices)
 
 
 def read_frames(source: Path, config: FramesConfig) -> Iterator[Timed]:
