@@ -16,6 +16,8 @@ LEFT = 3600  # [s], no file is written for so long
 INSTEAD = {
     rb"version https://git-lfs": "it is a pointer of Git LFS, not the file: run `git lfs pull`",
     rb"\s*<(!doctype )?html": "it is a web page in place of the file: download the file itself",
+    rb"(?s).{4}ftyp(hei|mif|avif)": "it is a picture of a phone (HEIC): save it as JPEG or PNG",
+    rb"(?s).{4}ftyp|\x1aE\xdf\xa3": "it is a video: save one of its frames as JPEG or PNG",
     rb"\Z": "it is empty: copy or download it again",
 }
 """What a file may be instead of what was expected, by its first bytes."""
@@ -64,7 +66,9 @@ def reason(error: Exception, path: Path | None = None) -> str:
     if path is not None and (found := instead(path)):
         return found
     if isinstance(error, UnicodeError):
-        return "it is no text in UTF-8"
+        return "it is no text in UTF-8: save it as UTF-8"
+    if "cannot identify image file" in str(error):
+        return "it is no picture that can be opened, such as JPEG or PNG"
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     spoken = isinstance(error, ValueError | RuntimeError | SyntaxError | OSError) or path is None

@@ -52,7 +52,7 @@ class Lens:
 
     file: Path | None = None
     """A calibration, or a photo of the same camera."""
-    fov: Annotated[float, float_in(1, 179)] | None = None
+    fov: Annotated[float, float_in(5, 175)] | None = None
 
 
 @dataclass(frozen=True)

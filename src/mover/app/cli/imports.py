@@ -42,7 +42,7 @@ class ImportArgs:
     """The reference image."""
     camera: Path | None = None
     """A calibration: camera.json, transforms of nerfstudio, cam_K.txt, OpenCV's XML, fov.json."""
-    fov: Annotated[float, float_in(1, 179)] | None = None
+    fov: Annotated[float, float_in(5, 175)] | None = None
     """Horizontal field of view, where there is no calibration: a guess, which `run` may mend
     [degrees]."""
     objects_masks: Path | None = None
@@ -204,6 +204,7 @@ def _masks(args: ImportArgs, parts: "Sequence[Parts]", hints: "Hints") -> "list[
     camera = next((p.camera for p in reversed(parts) if p.camera is not None), hints.camera)
     size = None if camera is None else (camera.value.get("w"), camera.value.get("h"))
     shape = None if hints.image is None else image_size(hints.image)
+    shape = shape or (None if camera is None else size)
     found: list[Parts] = []
     if args.objects_masks is not None:
         picture = "" if args.image is None else args.image.name

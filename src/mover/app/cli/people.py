@@ -97,6 +97,7 @@ def _counted(found: Any) -> str:  # noqa: ANN401
     return f"{len(found.person.unique())} people in {len(found.frame.unique())} frames"
 
 
+OUTSIDE = 0.5  # share of joints beyond the image: those of another size
 NO_VPOSER = "note: the printed pose prior is VPoser's; without --vposer ours stands in for it"
 Detector = Literal["openpose", "coco17", "halpe26"]
 
@@ -162,8 +163,16 @@ def fit_into(args: FitArgs, config: FitConfig | None = None) -> None:
     if args.model_folder is not None:
         os.environ["MOVER_BODY_MODELS"] = str(args.model_folder)
     camera, ground = _world(args)
+    joints = _keypoints(args)
+    x, y = joints.points[joints.confidence > 0].unbind(-1)
+    outside = (x > camera.width) | (y > camera.height) | (x < 0) | (y < 0)
+    if len(x) and (float(outside.double().mean()) > OUTSIDE or float(x.max()) <= 1):
+        reach = f"reach from ({x.min():.4g}, {y.min():.4g}) to ({x.max():.4g}, {y.max():.4g})"
+        size = f"pixels of the camera's image of {camera.width} x {camera.height}"
+        raise InputError(f"{args.source.name}: keypoints {reach}, expected {size}; are they of "
+                         "another size of the video?")  # fmt: skip
     inputs = FitInputs(
-        keypoints=_keypoints(args),
+        keypoints=joints,
         camera=camera,
         model=load_model(args.model, args.gender),  # pyright: ignore[reportArgumentType]
         start=None if args.start is None else read_bodies(args.start),

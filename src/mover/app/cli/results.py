@@ -70,9 +70,19 @@ def check(arguments: Sequence[str]) -> None:
     say(f"{args.source} is a valid capture; its initial scene is drawn in {args.out}")
 
 
+def _check_result(folder: Path) -> None:
+    """Say that a capture is no result."""
+    if (folder / "camera.json").is_file() and not (folder / "run.json").is_file():
+        cure = f"expected a result: mover run {folder} --out OUT"
+        raise InputError(f"{folder}: is a capture, {cure}")
+    if not folder.is_dir():
+        raise InputError(f"{folder}: there is no such folder, expected a result of mover run")
+
+
 def evaluate(arguments: Sequence[str]) -> None:
     """`mover evaluate`."""
     args = parsed(EvaluateArgs, "mover evaluate", arguments)
+    _check_result(args.out)
     from mover.evaluate.evaluation import evaluate_folder, table
 
     say(table(evaluate_folder(args.out, args.truth, physics=args.stable)))
@@ -103,6 +113,7 @@ class ExportArgs:
 def export(arguments: Sequence[str]) -> None:
     """`mover export`."""
     args = parsed(ExportArgs, "mover export", arguments)
+    _check_result(args.out)
     from mover.io.export.finished import Exported, read_finished
 
     writers = {target: chosen("--to", target, "export") for target in args.to}
@@ -134,6 +145,7 @@ class RenderArgs:
 def render(arguments: Sequence[str]) -> None:
     """`mover render`."""
     args = parsed(RenderArgs, "mover render", arguments)
+    _check_result(args.out)
     from mover.app.pictures.render import render_result
 
     count = render_result(args.out, args.to, args.config, args.capture)
@@ -156,6 +168,7 @@ class ViewArgs:
 def view(arguments: Sequence[str]) -> None:
     """`mover view`."""
     args = parsed(ViewArgs, "mover view", arguments)
+    _check_result(args.out)
     from mover.app.viewer.show import view_result
 
     view_result(args.out, args.edits, args.port)

@@ -183,7 +183,7 @@ class VideoArgs:
     camera: Path | None = None
     """A calibration (GeoCalib's also has pitch and roll), or a photo of the same camera, whose EXIF
     has the focal length."""
-    fov: Annotated[float, float_in(1, 179)] | None = None
+    fov: Annotated[float, float_in(5, 175)] | None = None
     """Horizontal field of view, where there is no calibration [degrees]."""
     depth: Path | None = None
     """Metric depth of the reference picture, for the first scene and the room."""

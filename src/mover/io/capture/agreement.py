@@ -106,7 +106,7 @@ def agreement(capture: Capture, other: tuple[Capture, Agreement] | None = None) 
         people_masks = [] if people is None or not len(people.frame) else [people.masks]
         object_masks = [d.mask for d in capture.detections if d.mask is not None]
         found = replace(
-            found, object_masks=_bounded(object_masks), people_masks=_bounded(people_masks)
+            found, object_masks=bounded(object_masks), people_masks=bounded(people_masks)
         )
     if bodies is None:
         return found
@@ -201,7 +201,7 @@ def _within(
     return torch.minimum(value / low, high / value).clamp_max(1)
 
 
-def _bounded(every: Sequence[Masks]) -> Float[Tensor, " masks"]:
+def bounded(every: Sequence[Masks]) -> Float[Tensor, " masks"]:
     """0 for some of the masks that fill most of the picture to three of its borders, else 1."""
     found: list[float] = []
     for masks in every[:MOST_MASKS]:

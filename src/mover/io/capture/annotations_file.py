@@ -33,8 +33,10 @@ def detections_of(at: At, camera: Camera, warn: Warn) -> tuple[Detection, ...]:
     """The instances of objects.json."""
     image = coco.check_image(_only_image(at), camera)
     names = coco.categories_of(at.get("categories"))
-    known, found = set[object](), list[Detection]()
-    for item in at.get("annotations").items():
+    known, found, rows = set[object](), list[Detection](), at.get("annotations")
+    if len(rows.items()) > coco.MOST_THINGS:
+        rows.refuse(f"at most {coco.MOST_THINGS} of one picture", f"{len(rows.items())} items")
+    for item in rows.items():
         row = checked(item, AnnotationFields)
         if row.image_id != image:
             item.get("image_id").refuse(f"{image}, the id of the one image")

@@ -37,6 +37,9 @@ def build_capture(parts: Parts) -> Capture:
     warn = warnings.append
     scene, turn = scene_of(parts.scene, parts.load_mesh, camera_of(parts.camera), warn)
     camera, lens = scene.camera, checked(parts.camera, CameraFields)
+    if (other := _lens(camera_of(parts.camera))) != _lens(camera):
+        warn(f"scene.json: its camera counts ({_lens(camera)}), not camera.json ({other}); "
+             "give one in both")  # fmt: skip
     detections = detections_of(parts.objects, camera, warn)
     _check_annotations(parts.scene, parts.objects.file, scene, detections, warn)
     people = people_of(parts.people, camera, warn) if parts.people else NO_PEOPLE
@@ -70,6 +73,13 @@ def build_capture(parts: Parts) -> Capture:
     )  # fmt: skip
     check_plausible(capture, warn)
     return dataclasses.replace(capture, warnings=tuple(warnings))
+
+
+def _lens(camera: Camera) -> str:
+    """Size and lens as a message names them."""
+    K = camera.K.tolist()
+    lens = f"fl_x {K[0][0]:.4g}, fl_y {K[1][1]:.4g}, cx {K[0][2]:.4g}, cy {K[1][2]:.4g}"
+    return f"{camera.width} x {camera.height}, {lens}"
 
 
 def _check_annotations(

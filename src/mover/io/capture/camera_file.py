@@ -14,7 +14,7 @@ from mover.geometry.rotations import affine, rot_y
 from mover.io.files.fields import LAST_INDEX, At, Warn, plain
 from mover.io.files.schema import Number, Positive, Rows, Share, Side, checked, rotation
 
-LARGEST_AREA = 1 << 28  # [px²]
+LARGEST_AREA = 1 << 27  # [px²]; the overlay of a larger one takes more than 6 GB
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 STEEPEST = 1.4  # [rad], beyond it a camera has no heading to speak of
 NO_TURN = 1e-6  # [rad]
@@ -50,7 +50,7 @@ def camera_of(at: At, other: Camera | None = None) -> Camera:
     lens = checked(at, CameraFields)
     if lens.w * lens.h > LARGEST_AREA:
         found = f"{lens.w} x {lens.h}"
-        at.get("w").refuse(f"an image of at most {LARGEST_AREA} pixels", found)
+        at.get("w").refuse(f"at most {LARGEST_AREA} pixels: scale image, masks and lens", found)
     for key in DISTORTION:
         given = at.maybe(key)
         if given is not None and checked(given, Number) != 0:
@@ -98,6 +98,8 @@ def camera_to_json(camera: Camera) -> dict[str, Any]:
 
 RIGID = 1e-2  # a matrix that is off by more is no rotation
 ZOOM = 0.05  # of the focal length: more is another lens
+NEXT = 5  # frames between two bodies whose motion is compared
+LESS = 0.25  # of the squared motion of people: other poses are meant
 STILL_POSES = 1e-9  # poses that differ by less are one
 
 
@@ -130,12 +132,35 @@ def path_of(at: At, camera: Camera, bodies: Bodies | None, warn: Warn) -> Camera
             reach = f"frames {frame[0]} to {frame[-1]}"
             at.get("frame").refuse(f"poses for all bodies, also for frame {end}", reach)
     relative = np.linalg.inv(T[first]) @ T
+    if bodies is not None and bodies.space == "camera" and (odd := _other_poses(T, frame, bodies)):
+        warn(f"{at.file}: people move far less under other poses; {odd}?")
     if np.abs(relative - np.eye(4)).max() < STILL_POSES:
         return STILL
     R, t = (
         torch.from_numpy(x.astype(np.float32)) for x in (relative[:, :3, :3], relative[:, :3, 3])
     )
     return CameraPath(torch.from_numpy(frame.astype(np.int64)), R, t)
+
+
+def _other_poses(T: NDArray[np.float64], frame: NDArray[np.int64], bodies: Bodies) -> str:
+    """In which other axes the poses seem to be: in those people hardly move from frame to frame."""
+    order = torch.argsort(bodies.person * (LAST_INDEX + 1) + bodies.frame).numpy()
+    row = np.searchsorted(frame, bodies.frame.numpy()[order]).clip(max=len(frame) - 1)
+    place = bodies.verts.mean(1).double().numpy()[order]
+    near = np.diff(bodies.person.numpy()[order]) == 0
+    near &= np.abs(np.diff(bodies.frame.numpy()[order])) <= NEXT
+    flip = np.diag([1.0, -1, -1, 1])
+    ways = {"": T, "are they from world to camera": np.linalg.inv(T),
+            "are they those of OpenGL (y up, z backward)": T @ flip,
+            "are they from world to camera, in OpenGL's axes": np.linalg.inv(flip @ T)}  # fmt: skip
+    moves: dict[str, float] = {}
+    for name, poses in ways.items():
+        turned = np.diff((poses[row, :3, :3] @ place[..., None])[..., 0], axis=0)[near]
+        way = np.diff(poses[row, :3, 3], axis=0)[near]
+        scale = max(0.0, -(turned * way).sum() / max((way * way).sum(), 1e-12))
+        moves[name] = float(np.square(turned + scale * way).sum())
+    best = min(moves, key=moves.__getitem__)
+    return best if moves[best] < LESS * moves[""] else ""
 
 
 def _poses(at: At, count: int) -> NDArray[np.float64]:
@@ -146,7 +171,10 @@ def _poses(at: At, count: int) -> NDArray[np.float64]:
     bad |= np.abs(T[:, 3] - [0, 0, 0, 1]).max(1) > RIGID
     if bad.any():
         which = int(np.argmax(bad))
-        at.refuse("poses of rotation and translation, last row 0 0 0 1", f"another at [{which}]")
+        at.refuse(
+            "poses of rotation and translation, last row 0 0 0 1",
+            f"one that is not rigid at [{which}]",
+        )
     T[:, :3, :3], T[:, 3] = u @ v, [0, 0, 0, 1]
     return T
 

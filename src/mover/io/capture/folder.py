@@ -34,7 +34,11 @@ REFERENCE, FURNITURE = "reference.jpg", "furniture.json"
 def read_capture(folder: Path) -> Capture:
     """Read and check a capture folder; its truth is not looked at."""
     if not folder.is_dir():
-        raise InputError(f"{folder}: there is no such folder, expected a capture")
+        what = "is a file" if folder.exists() else "there is no such folder"
+        raise InputError(f"{folder}: {what}, expected the folder of a capture")
+    inner = sorted(path.parent.name for path in folder.glob("*/camera.json"))
+    if inner and not (folder / "camera.json").exists():
+        raise InputError(f"{folder}: has no camera.json, but captures: {', '.join(inner[:4])}")
     parts = _files(folder, read_json)
     assert parts.objects is not None
     named = image_name(parts.objects)

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import logging
 import shutil
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import torch
 from mover.core.errors import InputError
 from mover.core.records import fingerprint, rows_of
 from mover.core.types import Bodies, Camera, Capture, Scene
+from mover.io.capture.agreement import bounded
 from mover.io.capture.annotations_file import detections_of, people_of
 from mover.io.capture.bodies_file import bodies_of, bodies_to_arrays, write_bodies
 from mover.io.capture.build import build_capture
@@ -31,6 +33,7 @@ from mover.io.masks.coco import annotations_tree
 
 log = logging.getLogger(__name__)
 
+MOST = 0.5  # share of masks that must be of things, not of what is around them
 SMALL_TURN = 1e-5  # a new rotation of the camera that is the old one
 
 
@@ -68,7 +71,7 @@ def import_into(folder: Path, *given: Parts) -> Imported:
         whole = replace(whole, objects=At(empty, "objects.json"))  # so the scene can be used
     capture = _capture(whole)
     if capture is None:
-        _check_apart(whole)
+        whole = replace(whole, notes=(*whole.notes, *_check_apart(whole)))
     folder.mkdir(parents=True, exist_ok=True)
     try:
         written = _write(whole, old, capture, folder)
@@ -207,8 +210,8 @@ def _capture(whole: Parts) -> Capture | None:
     return replace(capture, scene=replace(scene, objects=tuple(objects)))
 
 
-def _check_apart(whole: Parts) -> None:
-    """Check each part by itself while there is no whole capture."""
+def _check_apart(whole: Parts) -> Iterator[str]:
+    """Check each part by itself while there is no whole capture; what is odd."""
     ignored: list[str] = []
     if whole.bodies is not None:
         bodies_of(whole.bodies, ignored.append)
@@ -216,9 +219,14 @@ def _check_apart(whole: Parts) -> None:
     if camera is None and (whole.people is not None or whole.scene is not None):
         raise InputError(f"{whole.name}: has no camera, expected --camera FILE or --fov DEGREES")
     if camera is not None and whole.objects is not None:
-        detections_of(whole.objects, camera, ignored.append)
+        found = detections_of(whole.objects, camera, ignored.append)
+        inside = bounded([one.mask for one in found if one.mask is not None])
+        if len(inside) and inside.mean() < MOST:
+            yield f"{whole.objects.file}: most masks fill the picture to its borders; inverted?"
     if camera is not None and whole.people is not None:
-        people_of(whole.people, camera, ignored.append)
+        people = people_of(whole.people, camera, ignored.append).people
+        if people is not None and len(people.frame) and bounded([people.masks]).mean() < MOST:
+            yield f"{whole.people.file}: most masks fill the picture to its borders; inverted?"
 
 
 def _camera_of(whole: Parts) -> Camera | None:

@@ -25,6 +25,8 @@ MOST_TURNS = 1e3  # [rad], a yaw beyond has lost its digits
 OFF = 8.0  # factor between the size of an object and what its box implies, from which it is odd
 NEAREST = 0.05  # [m] before the camera, from where on a box implies a size
 SHORTEST, LONGEST = 0.05, 10.0  # [m] across, of the usual body
+USUAL = 1.8  # [m] across, of a body
+NEAR_BODY = 0.3  # [m] from the camera to the middle of the usual body
 TALLEST = 3.5  # [m] across, of any body
 NEAR_LENS, FAR_LENS = 0.05, 100.0  # focal lengths, in sides of the picture
 OFF_AXIS = 10.0  # sides of the picture from its corner to the axis of the lens
@@ -157,10 +159,10 @@ def check_bodies(bodies: Bodies, file: str, warn: Warn) -> None:
     middle = float(extent.median())
     field = f"{file}: field 'vertices'"
     if not SHORTEST <= middle <= LONGEST:
-        units = [name for name, per_metre in UNITS.items() if 0.5 < middle / per_metre < 3]
-        unit = f", so {units[0]}?" if units else ""
+        off = {abs(math.log(max(middle, 1e-9) / (USUAL * k))): name for name, k in UNITS.items()}
+        unit = f", as in {off[min(off)]}" if min(off) < 0.5 else ""
         raise InputError(
-            f"{field} has bodies that measure {middle:.3g} across{unit}; are they in metres,"
+            f"{field} has bodies that measure {middle:.4g} across{unit}; are they in metres,"
             f" expected {SHORTEST:g} to {LONGEST:g} m?"
         )
     far = torch.maximum(low.abs(), high.abs()).amax(-1)
@@ -168,10 +170,16 @@ def check_bodies(bodies: Bodies, file: str, warn: Warn) -> None:
         row = int(far.argmax())
         reach = f"reaches {float(far[row]):.3g} m away in row {row}"
         raise InputError(f"{field} {reach}, expected at most {FARTHEST:g} m")
+    away = float(((low + high) / 2).norm(dim=-1).median())
+    if bodies.space == "camera" and away < NEAR_BODY:
+        raise InputError(
+            f"{field} has bodies at the camera itself ({away:.2g} m away), expected metres before"
+            " it; was the translation left out?"
+        )
     if bodies.space == "camera" and float(bodies.verts[..., 2].median()) <= 0:
         raise InputError(
             f"{field} has most of the bodies behind the camera, expected z above 0 (the camera"
-            " frame is x right, y down, z forward)"
+            " frame is x right, y down, z forward); is 'space' (camera or world) right?"
         )
     if odd := int((extent > 2 * TALLEST).sum()):
         warn(f"{file}: {odd} of {len(extent)} bodies measure more than {2 * TALLEST:g} m across")

@@ -1,11 +1,12 @@
 """Pictures: the reference image, and its depth as networks give it."""
 
 import logging
+import math
 import warnings
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 import torch
@@ -74,7 +75,9 @@ def read_image_file(at: At, path: Path, camera: Camera) -> Float[Tensor, "h w 3"
             pixels = np.asarray(picture, dtype=np.float32)
     if pixels is None:
         expected = f"{camera.width} x {camera.height} pixels, as the camera has"
-        at.refuse(expected, f"{str(at.value)!r} with {size[0]} x {size[1]} pixels")
+        found = "" if str(at.value) == at.file else f"{str(at.value)!r} with "
+        cure = "; is it the camera's picture, uncut and unscaled (--camera, --fov)?"
+        at.refuse(expected + cure, f"{found}{size[0]} x {size[1]} pixels")
     return torch.from_numpy(pixels / np.float32(255))
 
 
@@ -100,6 +103,8 @@ DEPTH, DISPARITY = "depth", "disparity"
 NAMES = ("depth", "depth_metric", "metric_depth", "predicted_depth", "depths", "arr_0")
 FARTHEST = 100.0  # [m], what is farther is sky or nonsense
 MILLIMETRES = 1000.0
+FEWEST_KNOWN = 0.05  # share of the pixels whose depth is known
+NEAREST = 0.3  # [m], median of a room
 SAME_SHAPE = 0.03  # networks cut sides to multiples of 8 or 14 pixels
 ENDINGS = (".npy", ".npz", ".png")
 
@@ -169,6 +174,8 @@ def read_depth(
         case _:
             raise InputError(f"{path.name}: is no depth map, expected .npz, .npy or .png")
     known = np.isfinite(values) & (values > 0) & (values < (FARTHEST if metric else np.inf))
+    if known.mean() < FEWEST_KNOWN or (metric and np.median(values[known]) < NEAREST):
+        _refuse_depth(path, values[np.isfinite(values)], known, metric=metric)
     depth = torch.from_numpy(np.where(known, values, np.nan).astype(np.float32))
     h, w = depth.shape
     if abs(w * camera.height - h * camera.width) > SAME_SHAPE * w * camera.height:
@@ -177,6 +184,23 @@ def read_depth(
     rows = ((torch.arange(camera.height) + 0.5) * h / camera.height).long()
     columns = ((torch.arange(camera.width) + 0.5) * w / camera.width).long()
     return depth[rows][:, columns]
+
+
+def _refuse_depth(
+    path: Path, values: NDArray[np.float64], known: NDArray[np.bool_], *, metric: bool
+) -> NoReturn:
+    """Say why a depth map cannot be one of a room."""
+    middle = float(np.median(values)) if values.size else math.nan
+    wanted = f"distances of {NEAREST:g} to {FARTHEST:g} m" if metric else "values above 0"
+    cures = {
+        "divide by 1000, if it is in millimetres": middle > 500,
+        "negate it": middle < 0,
+        "divide by 100, if it is in centimetres": FARTHEST <= middle <= 500,
+        f"or {DISPARITY}/ in place of {DEPTH}/, if it is inverse depth": known.any(),
+    }
+    cure = next((f"; {text}" for text, fits in cures.items() if metric and fits), "")
+    found = f"has {100 * known.mean():.0f} % usable values (median of all {middle:.3g})"
+    raise InputError(f"{path.name}: {found}, expected {wanted}{cure}")
 
 
 def _of_npz(path: Path, names: tuple[str, ...], metric: bool, frame: int) -> NDArray[np.float64]:

@@ -16,6 +16,24 @@ from mover.geometry.rle import run_lengths
 from mover.io.files.fields import LAST_ID, At, Warn, unique
 from mover.io.files.schema import Id, Text, checked
 
+COCO_CLASSES = (
+    "person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat",
+    "traffic light", "fire hydrant", "stop sign", "parking meter", "bench", "bird", "cat", "dog",
+    "horse", "sheep", "cow", "elephant", "bear", "zebra", "giraffe", "backpack", "umbrella",
+    "handbag", "tie", "suitcase", "frisbee", "skis", "snowboard", "sports ball", "kite",
+    "baseball bat", "baseball glove", "skateboard", "surfboard", "tennis racket", "bottle",
+    "wine glass", "cup", "fork", "knife", "spoon", "bowl", "banana", "apple", "sandwich",
+    "orange", "broccoli", "carrot", "hot dog", "pizza", "donut", "cake", "chair", "couch",
+    "potted plant", "bed", "dining table", "toilet", "tv", "laptop", "mouse", "remote",
+    "keyboard", "cell phone", "microwave", "oven", "toaster", "sink", "refrigerator", "book",
+    "clock", "vase", "scissors", "teddy bear", "hair drier", "toothbrush",
+)  # fmt: skip
+"""The 80 classes in COCO's order; some tools count them from 0."""
+GAPS = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)
+"""Ids that COCO leaves out."""
+COCO_IDS = tuple(n for n in range(1, 91) if n not in GAPS)
+"""COCO's own ids of its classes."""
+MOST_THINGS = 5000  # in one picture
 CORNERS = 3  # a polygon has at least so many
 
 

@@ -1,6 +1,7 @@
 """Files of masks: COCO, lists of detections, labelme and others (JSON); pixels: label_images.py."""
 
 import dataclasses
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,13 @@ from mover.io.capture.parts import UNKNOWN, Hints, Parts
 from mover.io.files.fields import LAST_INDEX, At, read_json
 from mover.io.files.images import image_size
 from mover.io.files.schema import Id, Index, Share, Side, Text, checked
-from mover.io.masks.coco import CategoryFields, is_drawn
+from mover.io.masks.coco import (
+    COCO_CLASSES,
+    COCO_IDS,
+    MOST_THINGS,
+    CategoryFields,
+    is_drawn,
+)  # fmt: skip
 from mover.io.masks.instances import (
     Instance,
     Instances,
@@ -35,24 +42,6 @@ from mover.io.masks.label_images import (
 )
 from mover.io.people.values import PICKLES, natural, number_in
 
-COCO_CLASSES = (
-    "person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat",
-    "traffic light", "fire hydrant", "stop sign", "parking meter", "bench", "bird", "cat", "dog",
-    "horse", "sheep", "cow", "elephant", "bear", "zebra", "giraffe", "backpack", "umbrella",
-    "handbag", "tie", "suitcase", "frisbee", "skis", "snowboard", "sports ball", "kite",
-    "baseball bat", "baseball glove", "skateboard", "surfboard", "tennis racket", "bottle",
-    "wine glass", "cup", "fork", "knife", "spoon", "bowl", "banana", "apple", "sandwich",
-    "orange", "broccoli", "carrot", "hot dog", "pizza", "donut", "cake", "chair", "couch",
-    "potted plant", "bed", "dining table", "toilet", "tv", "laptop", "mouse", "remote",
-    "keyboard", "cell phone", "microwave", "oven", "toaster", "sink", "refrigerator", "book",
-    "clock", "vase", "scissors", "teddy bear", "hair drier", "toothbrush",
-)  # fmt: skip
-"""The 80 classes in COCO's order; some tools count them from 0."""
-GAPS = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)
-"""Ids that COCO leaves out."""
-COCO_IDS = tuple(n for n in range(1, 91) if n not in GAPS)
-"""COCO's own ids of its classes."""
-MOST_THINGS = 5000  # in one picture
 LEAST_SCORE = 0.3  # of MMDetection, which writes everything that it thought of
 EXPORTS = {
     "Label Studio's JSON": "COCO (polygons) or 'Brush labels to PNG'",
@@ -61,6 +50,8 @@ EXPORTS = {
     "YOLO's text": "COCO: it has no names and no size of the image",
     "a project of VIA": "COCO (Annotation, Export)",
     "an archive": "the files in it: unpack it",
+    "COCO's panoptic JSON": "COCO of instances, or its PNG as labels",
+    "Roboflow's predictions": "COCO segmentation",
 }
 """What is not read, and what to export in its place."""
 FOREIGN = {
@@ -113,7 +104,13 @@ def read_things(
     found = fitted(found, fit or size)
     if people:
         return people_in(found)
-    return dataclasses.replace(found, items=tuple(i for i in found.items if not is_person(i)))
+    kept = tuple(item for item in found.items if not is_person(item))
+    notes = found.notes
+    if bare := sum(item.category == UNKNOWN for item in kept):
+        notes += (f"{path.name}: {bare} of {len(kept)} masks have no category: --names 1=chair",)
+    if people_left := len(found.items) - len(kept):
+        notes += (f"{path.name}: {people_left} of people are left out (--reference-people)",)
+    return dataclasses.replace(found, items=kept, notes=notes)
 
 
 def read_people(path: Path, names: Names, size: Size | None, fit: Size | None = None) -> Instances:
@@ -146,6 +143,8 @@ def read_instances(
     head = path.read_bytes()[:2000] if path.is_file() else b""
     found = FOREIGN.get(kind)
     found = "CVAT's XML" if kind == ".xml" and b"<annotations" in head else found
+    if kind == ".txt" and not re.match(rb"\s*\d+(\s+[\d.]+){4}", head):
+        found = None
     if found and head:
         raise InputError(f"{path}: is {found}, expected {EXPORTS[found]}")
     kinds = ".json, .npz, .npy, .pkl, .png or a folder of pictures"
@@ -162,6 +161,15 @@ def _of_folder(
     if found := [file for home in homes for file in pictures_in(home)]:
         return read_label_images(found, path, names, people=people)
     files = sorted(path.glob("*.json"), key=natural)
+    stem = Path(picture or "").stem.lower()
+    ours = [file for file in files if file.stem.lower() == stem] if len(files) > 1 else []
+    if ours:
+        found = read_instances(ours[0], names, size, people=people, picture=picture)
+        said = f"{path.name}: of {len(files)} files only {ours[0].name} is taken"
+        return dataclasses.replace(found, notes=(said, *found.notes))
+    for file in sorted(path.iterdir()) if not files else ():
+        if file.suffix.lower() in FOREIGN:
+            return read_instances(file, names, size)
     if not files:
         raise InputError(f"{path}: has no masks, expected pictures (.png), .npy or .json files")
     parts = [_of_json(read_json(file), names, size, picture) for file in files]
@@ -190,6 +198,8 @@ def _of_json(at: At, names: Names, size: Size | None, picture: str | None) -> In
         ),
         "a project of VIA": any("_via_img_metadata" in one for one in keys)
         or any(isinstance(row, dict) and "regions" in row for row in inner),
+        "COCO's panoptic JSON": "segments_info" in str(at.value)[:100_000],
+        "Roboflow's predictions": {"predictions", "image"} <= keys[0] if keys else False,
     }
     for found in (name for name, seen in foreign.items() if seen):
         raise InputError(f"{at.file}: is {found}, expected its export as {EXPORTS[found]}")
@@ -200,6 +210,10 @@ def _of_json(at: At, names: Names, size: Size | None, picture: str | None) -> In
         return _of_grounded_sam(at)
     if "predictions" in have or {"labels", "scores"} <= have:
         return _of_mmdet(at, names, size)
+    if "annotations" in have and "image" in have - {"images"} and "images" not in have:  # SA-1B
+        rows = [{**row.mapping(), "image_id": 0} for row in at.get("annotations").items()]
+        tree = {"images": [{**at.get("image").mapping(), "id": 0}], "annotations": rows}
+        return coco_instances(at.holding(tree), names, size, picture)
     if "annotations" in have:
         return coco_instances(at, names, size, picture)
     if "shapes" in have:
@@ -322,6 +336,8 @@ def list_instances(at: At, names: Names, size: Size | None) -> Instances:
     An item has `class` (a name) or `category_id`; `bbox` and `segmentation` or `mask`. COCO's ids
     have gaps; a file whose ids only make sense counted from 0 is read so. Frames are image_ids.
     """
+    if any(isinstance(row, dict) and "box" in row for row in at.value):
+        at = _of_ultralytics(at)
     rows = [(item, checked(item, RowFields)) for item in at.items()]
     for item, row in rows:
         if row.bbox is None and row.mask is None and not is_drawn(row.segmentation):
@@ -338,6 +354,24 @@ def list_instances(at: At, names: Names, size: Size | None) -> Instances:
         size = _size_of(given) if given is not None and isinstance(given.value, dict) else size
         found.append(_instance(item, row, size, words, frames))
     return Instances(tuple(found), size, at.file, frozenset(frames.values()), notes)
+
+
+def _of_ultralytics(at: At) -> At:
+    """Rows of Ultralytics' `to_json` as detections with names, corners and polygons."""
+    rows: list[dict[str, Any]] = []
+    for row in at.items():
+        box, outline = row.get("box"), row.maybe("segments")
+        corners = [box.get(key).number() for key in ("x1", "y1", "x2", "y2")]
+        new = {
+            "class": row.get("name").text(),
+            "bbox": corners,
+            "score": row.value.get("confidence"),
+        }
+        if outline is not None:
+            x, y = (outline.get(axis).items() for axis in "xy")
+            new["segmentation"] = [[v.value for pair in zip(x, y, strict=False) for v in pair]]
+        rows.append({**new, "track_id": row.value.get("track_id")})
+    return at.holding(rows)
 
 
 def _instance(

@@ -141,9 +141,9 @@ def people_in(found: Instances) -> Instances:
     if not kept and others:
         kept = [item for item in found.items if unknown_names([item.category])]
         named = listed("name", [repr(name) for name in others])
-        notes.append(
-            f"{named} taken as people's" if kept else f"{found.file} has no people, only {named}"
-        )
+        if not kept:
+            raise InputError(f"{found.file}: has no people, only {named}, expected masks of people")
+        notes.append(f"{named} taken as people's")
     return dataclasses.replace(found, items=tuple(kept), notes=tuple(notes))
 
 

@@ -34,6 +34,7 @@ FRAME_WORDS = frozenset(
 MOST_LABELS = 256
 WHITE = (255, 65535, 0xFFFFFF)
 NEAR = 8  # values so near to black or white are black or white, where a mask is soft
+PHOTO = 0.3  # share of the pixels that are neither dark nor bright, which masks have not
 SAME = 0.5  # overlap of the same person in two frames that follow each other
 Names = Mapping[str, str]
 """Categories where the source has none: by number, file name or index."""
@@ -60,7 +61,8 @@ def read_label_images(
     """
     home = source if source.is_dir() else source.parent
     table = {**_names_beside(home / LABELS), **names}
-    paths = sorted((p for p in paths if p.stem.lower() not in NOT_MASKS), key=natural)
+    if source.is_dir():
+        paths = sorted((p for p in paths if p.stem.lower() not in NOT_MASKS), key=natural)
     homes = list(dict.fromkeys(path.parent for path in paths))
     apart = source.is_dir() and source not in homes
     numbers = _numbers_of([path.stem for path in paths], people=people or apart)
@@ -202,10 +204,10 @@ def _labels_of(path: Path) -> NDArray[np.int64]:
         grey = (pixels[..., :1] == pixels).all()
         weights = [1, 0, 0] if grey or kind in LOSSY else [1, 256, 65536]
         pixels = pixels[..., :3] @ weights
-    return pixels if drawn else _hardened(pixels, lossy=kind in LOSSY)
+    return pixels if drawn else _hardened(pixels, path.name, lossy=kind in LOSSY)
 
 
-def _hardened(pixels: NDArray[np.int64], *, lossy: bool) -> NDArray[np.int64]:
+def _hardened(pixels: NDArray[np.int64], name: str, *, lossy: bool) -> NDArray[np.int64]:
     """Labels without the grey rims of soft or resized masks: values that fill no area are rims."""
     values = np.unique(pixels)
     most = int(values[-1])
@@ -225,6 +227,9 @@ def _hardened(pixels: NDArray[np.int64], *, lossy: bool) -> NDArray[np.int64]:
     between = np.unique(clean[(clean > 0) & (clean < most)])
     inner = counts[solid < most].sum()
     soft = most in WHITE[:2] and len(between) > 1 and inner <= 0.1 * max(1, counts.sum())
+    photo = (np.abs(pixels - most / 2) < 0.3 * most).mean() > PHOTO
+    if photo and (lossy or len(between) > MOST_LABELS):
+        raise InputError(f"{name}: has {len(values)} values, as a photo, expected a mask or labels")
     if lossy or soft:
         return np.where(pixels > most // 2, most, 0)
     if len(between) > 2 * len(solid):
