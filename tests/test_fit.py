@@ -31,9 +31,12 @@ from mover.io.capture.scene_file import write_scene
 
 QUICK = FitConfig(
     start_steps=20,
+    noise_steps=20,
     stages=(dataclasses.replace(STAGES[0], steps=25), dataclasses.replace(STAGES[1], steps=50)),
 )
 
+SURE = dataclasses.replace(QUICK, noise_steps=100)
+"""Statures, and so distances, are known as well as keypoints allow."""
 TERM = {term.name: term.cost for term in BODY_TERMS}
 FEW = FitConfig(start_steps=2, stages=(dataclasses.replace(STAGES[1], steps=5),))
 """Enough to see that it runs, not to be right."""
@@ -67,9 +70,16 @@ def walk():
     return as_bodies(*walker())
 
 
-@pytest.mark.slow
-def test_lasting_offsets_of_a_detector_do_not_change_the_stature(walk):
+@pytest.fixture(scope="module")
+def sharp(walk):
+    """Keypoints of the walk with little noise, and what is fitted to them."""
     keypoints = seen(walk, noise=1.0)
+    return keypoints, fit(keypoints)
+
+
+@pytest.mark.slow
+def test_lasting_offsets_of_a_detector_do_not_change_the_stature(sharp):
+    keypoints, true = sharp
     height = keypoints.points[..., 1].amax(1) - keypoints.points[..., 1].amin(1)
     names = LAYOUTS[keypoints.layout]
     off = torch.zeros_like(keypoints.points)
@@ -78,8 +88,7 @@ def test_lasting_offsets_of_a_detector_do_not_change_the_stature(walk):
             off[:, names.index(f"{side}_{name}"), 1] = share * height
     wrong = dataclasses.replace(keypoints, points=keypoints.points + off)
     usual, dirs = heights_of(open_body())
-    fits = [fit(k) for k in (keypoints, wrong)]
-    right, biased = (usual + float(f.bodies.pose.betas[0] @ dirs) for f in fits)
+    right, biased = (usual + float(f.bodies.pose.betas[0] @ dirs) for f in (true, fit(wrong)))
     assert abs(biased - right) < 0.04
     assert 1.5 < biased < 1.85
 
@@ -198,7 +207,7 @@ def test_bodies_of_another_tool_are_put_under_the_true_camera(walk):
     )
     start = as_bodies(wrong, walk.frame)
     before = (start.joints - start.joints[:, :1] - walk.joints + walk.joints[:, :1])[:, :22]
-    out = fit(seen(walk, noise=2.0), None, start)
+    out = fit(seen(walk, noise=2.0), QUICK, start)
     aligned, absolute = off(out, walk)
     assert aligned < 0.6 * float(before.norm(dim=-1).mean())
     assert absolute < 0.25
@@ -229,7 +238,7 @@ def test_two_people_keep_their_own_shapes_and_places():
     a, b = seen(one), seen(two)
     names = ("points", "confidence", "frame", "person")
     both = dataclasses.replace(a, **{n: torch.cat([getattr(x, n) for x in (a, b)]) for n in names})
-    out = fit(both).bodies
+    out = fit(both, SURE).bodies
     assert out.person.tolist() == [0] * 5 + [4] * 5
     assert out.pose.betas.unique(dim=0).shape[0] == 2
     assert (out.joints[:5, 0] - one.joints[:, 0]).norm(dim=-1).mean() < 0.4
@@ -272,22 +281,20 @@ def test_a_person_in_one_frame_and_an_unordered_image_are_fitted(walk):
 
 
 @pytest.mark.slow
-def test_a_known_floor_carries_people(walk):
-    keypoints = seen(walk, noise=3.0)
+def test_a_known_floor_carries_people(walk, sharp):
+    keypoints, plain = sharp
     floor = float((walk.verts @ CAMERA.R_cam_world[:, 1]).min()) + 0.2
-    plain = fit(keypoints).bodies
-    carried = fit(keypoints, ground=floor).bodies
+    carried = fit(keypoints, ground=floor)
     depth = [
-        (floor - b.joints @ CAMERA.R_cam_world[:, 1]).clamp_min(0).amax(1).mean()
-        for b in (plain, carried)
+        (floor - f.bodies.joints @ CAMERA.R_cam_world[:, 1]).clamp_min(0).amax(1).mean()
+        for f in (plain, carried)
     ]
     assert depth[1] < 0.5 * depth[0]
 
 
 @pytest.mark.slow
-def test_a_long_video_in_stretches_is_the_video_at_once(walk):
-    keypoints = seen(walk, noise=1.0)
-    whole = fit(keypoints)
+def test_a_long_video_in_stretches_is_the_video_at_once(walk, sharp):
+    keypoints, whole = sharp
     parts = fit(keypoints, dataclasses.replace(QUICK, chunk=10))
     assert parts.bodies.frame.tolist() == whole.bodies.frame.tolist()
     assert abs(off(parts, walk)[0] - off(whole, walk)[0]) < 0.02
@@ -496,7 +503,7 @@ def test_the_height_of_numbers_of_the_shape_is_that_of_the_body():
 def test_people_of_known_height_are_where_they_are(walk):
     tall = float(np.ptp(shaped(open_body(), walk.pose.betas[:1])[0][0, :, 1].numpy()))
     keypoints = seen(walk, noise=3.0)
-    right, tenth = (fit(keypoints, heights=(share * tall,)) for share in (1.0, 1.1))
+    right, tenth = (fit(keypoints, SURE, heights=(share * tall,)) for share in (1.0, 1.1))
     assert right.bodies.size_spread == 0.0  # fitted bodies still: the floor under them may lean
     (_, near), (_, wrong) = (off(one, walk) for one in (right, tenth))
     assert near < 0.1
