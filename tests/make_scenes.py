@@ -420,8 +420,7 @@ def write_masks(folder: Path, masks: np.ndarray, names: list[str]) -> dict[str, 
             for i, (m, b) in enumerate(zip(masks, boxes, strict=True))
         ]  # fmt: skip
         save(key, f"{key}.json", {**base, "annotations": rows})
-    coco = {"chair": 62, "couch": 63, "bed": 65, "dining table": 67, "person": 1}
-    order = {"chair": 56, "couch": 57, "bed": 59, "dining table": 60, "person": 0}
+    coco, order = {"chair": 62, "couch": 63, "person": 1}, {"chair": 56, "couch": 57, "person": 0}
     for key, table in (("results", coco), ("detectron2", order)):
         save(key, f"{key}.json", [
             {"image_id": 3, "category_id": table[names[i]], "score": 0.5, "bbox": [0, 0, 1, 1],
@@ -440,17 +439,13 @@ def write_masks(folder: Path, masks: np.ndarray, names: list[str]) -> dict[str, 
     np.savez(out["npz"], masks=masks, scores=np.full(n, 0.5), labels=np.array(names))
     out["npz_logits"] = folder / "logits.npz"
     np.savez(out["npz_logits"], masks=np.where(masks, 3.0, -3.0)[:, None].astype("f4"))
-    out["labels"] = folder / "labels"
-    out["labels"].mkdir()
+    for key in ("labels", "files", "alpha"):
+        out[key] = folder / key
+        out[key].mkdir()
     numbers = (masks * np.arange(1, n + 1)[:, None, None]).sum(0).astype(np.uint8)
     Image.fromarray(numbers).save(out["labels"] / "map.png")
-    (out["labels"] / "labels.json").write_text(
-        json.dumps({str(i + 1): name for i, name in enumerate(names)})
-    )
-    out["files"] = folder / "files"
-    out["files"].mkdir()
-    out["alpha"] = folder / "alpha"
-    out["alpha"].mkdir()
+    named = {str(k): name for k, name in enumerate(names, start=1)}
+    (out["labels"] / "labels.json").write_text(json.dumps(named))
     for i, m in enumerate(masks):
         Image.fromarray((m * 255).astype(np.uint8)).save(out["files"] / f"{names[i]}_{i}.png")
         rgba = np.zeros((h, w, 4), dtype=np.uint8)

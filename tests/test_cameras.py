@@ -250,7 +250,6 @@ def test_wrong_cameras_are_refused_in_a_sentence_and_another_lens_is_said(captur
 
 
 def test_people_of_a_moving_camera_must_be_in_its_axes(capture, tmp_path):
-    assert capture.bodies is not None
     world = replace(capture.bodies, space="world")
     write_capture(replace(capture, bodies=world), tmp_path / "room")
     at = At({"frame": np.arange(COUNT), "T_world_camera": true_path()}, "cameras.npz")

@@ -1,6 +1,6 @@
 """Labels of contact: a part of the body, an object, a place on its surface, its normal."""
 
-import dataclasses
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,10 +26,7 @@ def standing(frames: int = 6) -> Bodies:
     bodies = bodies_of(zero_pose(frames, open_body()))
     lift = GROUND - float(bodies.verts[..., 1].min())
     up = torch.tensor([0.3, lift, -3.0])
-    assert bodies.joints is not None
-    return dataclasses.replace(
-        bodies, verts=bodies.verts + up, joints=bodies.joints + up, pose=None
-    )
+    return replace(bodies, verts=bodies.verts + up, joints=bodies.joints + up, pose=None)
 
 
 def labelled(bodies: Bodies, *meshes: Mesh, floor: float | None = GROUND) -> ContactLabels:
@@ -142,7 +139,7 @@ def test_a_result_without_labels_says_what_writes_them(tmp_path, capsys):
 def test_labels_come_back_from_their_file_and_a_wrong_one_is_refused(tmp_path):
     out, labels = out_with_labels(tmp_path)
     again = read_labels(out / "contacts.npz")
-    for field in dataclasses.fields(ContactLabels):
+    for field in fields(ContactLabels):
         same = getattr(labels, field.name) == getattr(again, field.name)
         assert same if isinstance(same, bool) else same.all(), field.name
     with np.load(out / "contacts.npz") as data:

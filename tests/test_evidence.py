@@ -75,9 +75,8 @@ def test_a_person_before_an_object_is_near_evidence_and_a_hidden_one_far(hide):
 def test_the_table_shows_every_object_and_every_warning():
     capture = room(hide=False)
     lines = evidence_table(capture, gather_evidence(capture)).splitlines()
-    assert " ".join(lines[0].split()) == (
-        "object category mask px near px far px frames contacts missing"
-    )
+    columns = "object category mask px near px far px frames contacts missing"
+    assert lines[0].split() == columns.split()
     assert [line.split()[0] for line in lines[1:5]] == ["cupboard", "lamp", "box", "guess"]
     assert lines[5:] == [f"warning: {text}" for text in capture.warnings]
     assert lines[5:]

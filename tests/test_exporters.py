@@ -13,6 +13,7 @@ import torch
 import trimesh
 from furnished import bodies_of, furnished, moving_pose, similar, two_people, write_out
 from little_room import walkers
+from make_scenes import four
 from PIL import Image
 from test_export import bounds_of, textured
 
@@ -51,9 +52,8 @@ class Glb:
         size = struct.unpack("<I", raw[12:16])[0]
         self.tree = json.loads(raw[20 : 20 + size])
         self.block = raw[28 + size :]
-        self.parent = {
-            c: k for k, node in enumerate(self.tree["nodes"]) for c in node.get("children", [])
-        }
+        nodes = enumerate(self.tree["nodes"])
+        self.parent = {child: k for k, node in nodes for child in node.get("children", [])}
 
     def array(self, index: int) -> np.ndarray:
         accessor = self.tree["accessors"][index]
@@ -95,17 +95,15 @@ class Glb:
         else:
             x, y, z, w = self.value(node, "rotation", time, [0, 0, 0, 1])
             turn = trimesh.transformations.quaternion_matrix([w, x, y, z])[:3, :3]
-            local = np.eye(4)
-            local[:3, :3] = turn * self.value(node, "scale", time, [1, 1, 1])
-            local[:3, 3] = self.value(node, "translation", time, [0, 0, 0])
+            size = self.value(node, "scale", time, [1, 1, 1])
+            local = four(turn * size, self.value(node, "translation", time, [0, 0, 0]))
         return self.matrix(self.parent.get(node), time) @ local
 
     def skinned(self, name: str, time: float) -> np.ndarray:
         node = self.tree["nodes"][self.named(name)]
         part = self.tree["meshes"][node["mesh"]]["primitives"][0]["attributes"]
-        verts, joints, weights = (
-            self.array(part[key]) for key in ("POSITION", "JOINTS_0", "WEIGHTS_0")
-        )
+        keys = ("POSITION", "JOINTS_0", "WEIGHTS_0")
+        verts, joints, weights = (self.array(part[key]) for key in keys)
         skin = self.tree["skins"][node["skin"]]
         inverse = self.array(skin["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
         moves = np.stack([self.matrix(j, time) for j in skin["joints"]]) @ inverse
@@ -126,11 +124,8 @@ class Glb:
 
 def rows(bodies: Bodies, person: int) -> list[tuple[int, float]]:
     first = int(bodies.frame.min())
-    return [
-        (k, (int(bodies.frame[k]) - first) / (bodies.fps or 5.0))
-        for k in range(len(bodies.frame))
-        if int(bodies.person[k]) == person
-    ]
+    found = (bodies.person == person).nonzero()[:, 0].tolist()
+    return [(k, (int(bodies.frame[k]) - first) / (bodies.fps or 5.0)) for k in found]
 
 
 def miss(found: np.ndarray, verts: torch.Tensor) -> float:

@@ -116,42 +116,33 @@ def mask_data(folder: Path) -> Path:
     return folder
 
 
-VIDEOS = {  # how a walker is written, and his track
-    "frame_0001.png": (of_pictures("frame_{1:04d}.png"), 0),
+VIDEOS = {  # how a walker is written, his track, and what is said of frames and tracks
+    "frame_0001.png": (of_pictures("frame_{1:04d}.png"), 0, "white masks are one person",
+                       "numbers 1 to 8 with 3 left out count from 1: 1 is frame 0"),
     "1.png": (of_pictures("{1}.png"), 0),
     "000000.jpg": (of_pictures("{0:06d}.jpg"), 0),
     "mask_00000_soft.png": (of_pictures("mask_{0:05d}.png", soft=True), 0),
     "000001/00000.png": (of_pictures("{0:05d}.png", home="000007"), 7),
-    "results from 1": (results(1), 0),
-    "results from 0": (results(0), 0),
+    "results from 1": (results(1), 0, "image_ids 1 to 8 with 3 left out count from 1"),
+    "results from 0": (results(0), 0, "people without tracks: 1, one in each frame"),
     "coco from 1": (coco("", 1), 0),
     "coco of cvat": (coco("frame_{:06d}.PNG", 1), 0),
     "segments": (segments, 1),
     "mask_data": (mask_data, 2),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("way", VIDEOS)
 def test_frames_keep_their_numbers_over_gaps_and_a_person_is_one_track(way, tmp_path):
-    write, track = VIDEOS[way]
+    write, track, *said = VIDEOS[way]
     found = read_people(write(tmp_path / "in"), {}, None)
+    assert all(any(words in note for note in found.notes) for words in said), found.notes
     assert "coco" not in way or found.frames == set(range(8))  # also those without people
     got = pixels(found)
     assert list(got) == [(frame, track) for frame in KEPT]
     for (frame, _), mask in got.items():
         off = (mask ^ walker(frame)).sum() / walker(frame).sum()
         assert off <= (0.15 if "soft" in way or "jpg" in way else 0)
-
-
-@pytest.mark.parametrize(("way", "said"), [
-    ("frame_0001.png", "numbers 1 to 8 with 3 left out count from 1: 1 is frame 0"),
-    ("results from 1", "image_ids 1 to 8 with 3 left out count from 1"),
-    ("frame_0001.png", "white masks are one person"),
-    ("results from 0", "people without tracks: 1, one in each frame"),
-])  # fmt: skip
-def test_what_is_decided_of_frames_and_tracks_is_said(way, said, tmp_path):
-    notes = read_people(VIDEOS[way][0](tmp_path / "in"), {}, None).notes
-    assert any(said in note for note in notes), notes
 
 
 @pytest.mark.parametrize("boxes", [True, False])

@@ -87,21 +87,13 @@ def said(error: InputError) -> str:
 # Captures.
 
 
-def places_of(tree: Any, way: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    keys = tree if isinstance(tree, dict) else range(len(tree)) if isinstance(tree, list) else ()
-    found = [way] if way else []
-    for key in keys:
-        found += places_of(tree[key], (*way, key))
-    return found
-
-
 def in_json(folder: Path, rng: np.random.Generator) -> str:
     """One value of one file is another, is a multiple of itself, or is not there."""
     path = folder / str(rng.choice(["camera", "scene", "objects", "people", "hypotheses"]))
     path = path.with_suffix(".json")
     tree = json.loads(path.read_text())
-    places = places_of(tree)
-    way = places[rng.integers(len(places))]
+    ways = tiny.ways_of(tree)
+    way = ways[rng.integers(len(ways))]
     old, kind = functools.reduce(lambda node, key: node[key], way, tree), rng.integers(4)
     if kind == 0 and isinstance(old, float | int) and not isinstance(old, bool):
         new: Any = old * FACTORS[rng.integers(len(FACTORS))]

@@ -41,10 +41,6 @@ def prox(plain, tmp_path_factory):
     return root
 
 
-def test_the_booths_are_left_out(prox):
-    assert recordings_of(prox) == [RECORDING]
-
-
 def test_prox_gives_flipped_frames_its_lens_and_the_truth(prox, plain, tmp_path):
     out, room = tmp_path / "out", prox_room(plain)
     boxes = prox / "boxes" / "bbox3d.json"
@@ -59,6 +55,7 @@ def test_prox_gives_flipped_frames_its_lens_and_the_truth(prox, plain, tmp_path)
     assert np.abs(flipped - np.asarray(layouts.picture(room.size)).astype(int)).mean() < 3
     check_truth(out / "truth", room)
     check_scan(out / "truth_scan", room)
+    check_keypoints(out / "keypoints" / "000001_keypoints.json")
 
 
 def check_scan(folder: Path, room: layouts.Room) -> None:
@@ -74,28 +71,26 @@ def check_scan(folder: Path, room: layouts.Room) -> None:
         assert (verts[mesh.faces.numpy()][..., 1].max(1) - truth.ground > 0.9 * FLOOR).all()
 
 
-def test_keypoints_of_mirrored_pictures_change_sides(prox, tmp_path):
-    imported("prox", prox, tmp_path / "out", tmp_path, recording=RECORDING)
-    tree = json.loads((tmp_path / "out" / "keypoints" / "000001_keypoints.json").read_text())
-    joints = np.array(tree["people"][0]["pose_keypoints_2d"]).reshape(-1, 3)
+def check_keypoints(file: Path) -> None:
+    """Those of mirrored pictures change sides."""
+    (person,) = json.loads(file.read_text())["people"]
+    joints = np.array(person["pose_keypoints_2d"]).reshape(-1, 3)
     assert joints[7].tolist() == [1920 - 101, 200, 0.9]  # the left wrist
     assert not joints[4].any()
-    hands = [np.array(tree["people"][0][f"hand_{s}_keypoints_2d"]) for s in ("right", "left")]
+    hands = [np.array(person[f"hand_{s}_keypoints_2d"]) for s in ("right", "left")]
     assert hands[0].any()
     assert not hands[1].any()
 
 
-def test_axes_by_columns_are_understood(plain, tmp_path):
-    layouts.write_prox(tmp_path / "p", prox_room(plain), RECORDING, 1, np.array([0.0, 1, 2]))
-    layouts.write_truth(tmp_path / "p" / "boxes", prox_room(plain), columns=True)
-    imported(
-        "prox", tmp_path / "p", tmp_path / "out", tmp_path, recording=RECORDING,
-        boxes=tmp_path / "p" / "boxes" / "bbox3d.json",
-    )  # fmt: skip
+def test_axes_by_columns_are_understood(prox, plain, tmp_path):
+    layouts.write_truth(tmp_path, prox_room(plain), columns=True)
+    boxes = tmp_path / "bbox3d.json"
+    imported("prox", prox, tmp_path / "out", tmp_path, recording=RECORDING, boxes=boxes)
     check_truth(tmp_path / "out" / "truth", prox_room(plain))
 
 
-def test_an_unknown_recording_is_named_with_those_there_are(prox, tmp_path):
+def test_booths_are_left_out_and_an_unknown_recording_is_named_with_those_there_are(prox, tmp_path):
+    assert recordings_of(prox) == [RECORDING]
     with pytest.raises(InputError, match=RECORDING):
         imported("prox", prox, tmp_path / "out", tmp_path, recording="MPH11_1_1")
 

@@ -1,11 +1,10 @@
 """Whatever a source holds: it is imported or refused with a message; nothing in it runs."""
 
-import dataclasses
 import json
 import shutil
 import tempfile
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import make_scenes as layouts
 import numpy as np
@@ -40,11 +39,8 @@ def little() -> layouts.Room:
 
 @pytest.fixture(scope="module")
 def sources(tmp_path_factory):
-    room, home, steps = (
-        little(),
-        tmp_path_factory.mktemp("sources"),
-        np.stack([tiny.STEP + AHEAD] * 2),
-    )
+    room, home = little(), tmp_path_factory.mktemp("sources")
+    steps = np.stack([tiny.STEP + AHEAD] * 2)
     masks = np.zeros((2, 48, 64), dtype=bool)
     masks[0, 5:20, 3:20], masks[1, 22:40, 30:50] = True, True
     kinds = layouts.write_masks(home / "masks", masks, ["chair", "couch"])
@@ -131,17 +127,6 @@ JUNK = st.recursive(
 )  # fmt: skip
 
 
-def ways_of(tree: Any, way: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """The place of every value in nested lists and objects; long lists at their ends only."""
-    found = [way] if way else []
-    keys: Any = tree if isinstance(tree, dict) else ()
-    if isinstance(tree, list):
-        keys = range(len(tree)) if len(tree) < 30 else (0, len(tree) - 1)
-    for key in keys:
-        found += ways_of(tree[key], (*way, key))
-    return found
-
-
 @pytest.mark.slow
 @FUZZ
 @given(
@@ -157,7 +142,7 @@ def test_no_junk_in_any_json_field_raises_anything_else(sources, format, which, 
             return
         path = paths[which % len(paths)]
         tree = json.loads(path.read_text())
-        ways = ways_of(tree)
+        ways = tiny.ways_of(tree, most=30)
         tiny.put(tree, ways[which % len(ways)], value)
         path.write_text(json.dumps(tree, default=str))
         import_or_refuse(format, source, home)
@@ -202,10 +187,8 @@ def test_headers_of_a_thousand_million_vertices_are_refused(tmp_path, kind):
 @pytest.mark.parametrize("name", ["../../escaped", "/tmp/escaped", "..", "a/b", "CON:", "\0", ""])
 def test_names_cannot_leave_the_folder(tmp_path, name):
     room = little()
-    things = [dataclasses.replace(t, name=name or "x") for t in room.things[:1]]
-    source = layouts.write_boxes(
-        tmp_path / "in" / "a.json", dataclasses.replace(room, things=things)
-    )
+    things = [replace(t, name=name or "x") for t in room.things[:1]]
+    source = layouts.write_boxes(tmp_path / "in" / "a.json", replace(room, things=things))
     assert import_or_refuse("boxes", source, tmp_path) or "\0" in name
     tree = json.loads(source.read_text())
     tree["objects"][0]["category"] = name

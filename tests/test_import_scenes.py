@@ -48,7 +48,6 @@ def plain(small_room):
                 piece.t_world_object.double().numpy(), float(piece.yaw), stretch,
             )
         )  # fmt: skip
-    assert small_room.truth.ground is not None
     return layouts.Room(
         camera.K.double().numpy(), camera.R_cam_world.double().numpy(),
         (camera.width, camera.height), small_room.truth.ground, things,

@@ -11,32 +11,10 @@ from hypothesis import strategies as st
 from judged import F64, cuboid, grid_body, mesh_of, people, some_people
 from scipy.spatial.transform import Rotation
 
-from mover.evaluate.bodies import (
-    Standing,
-    Twins,
-    gather_twins,
-    ground_penetration_distance,
-    ground_penetration_frequency,
-    p_pje,
-    p_v2v,
-    pje,
-    procrustes,
-    v2v,
-)
-from mover.evaluate.contact import (
-    Nearness,
-    StandingMesh,
-    Touch,
-    contact,
-    contact_f1,
-    evenly,
-    gather_touch,
-    gather_truth,
-    nearness,
-    non_collision,
-)
+from mover.evaluate import bodies as errors
+from mover.evaluate import contact as contacts
 
-BOX = [StandingMesh(cuboid(1, 1, 1))]  # its top is at 1
+BOX = [contacts.StandingMesh(cuboid(1, 1, 1))]  # its top is at 1
 INSIDE, ABOVE = (0.92, 1.32), (1.04, 1.44)  # five rows, of which one is inside; none is
 
 
@@ -47,10 +25,10 @@ def test_collision_and_contact_are_shares_of_vertices_and_means_over_bodies(
     bodies, free, share, rows
 ):
     people = some_people(torch.cat([grid_body(*heights) for heights in bodies]))
-    touch = gather_touch(people, BOX, None, 10, 0.05)
-    assert non_collision(touch) == pytest.approx(free)
-    assert contact(touch) == pytest.approx(share)
-    assert contact_f1(touch) is None
+    touch = contacts.gather_touch(people, BOX, None, 10, 0.05)
+    assert contacts.non_collision(touch) == pytest.approx(free)
+    assert contacts.contact(touch) == pytest.approx(share)
+    assert contacts.contact_f1(touch) is None
     assert bodies != [ABOVE] or int((touch.near.surface <= 0.05).sum()) == rows
 
 
@@ -58,20 +36,21 @@ def test_contact_f1_compares_the_touching_vertices_with_the_true_ones():
     true = some_people(grid_body(1.0, 1.4, 9))  # heights 1, 1.05, 1.1, ...: two rows touch
     high = some_people(grid_body(1.04, 1.44, 9))  # one row touches
     for judged, expected in ((true, 1.0), (high, 2 * 9 / (9 + 18))):
-        truth = gather_truth(true, BOX, judged, 10, 0.0501)
-        assert contact_f1(gather_touch(judged, BOX, truth, 10, 0.0501)) == pytest.approx(expected)
-    none = Nearness(torch.full((1, 3), torch.inf), torch.full((1, 3), torch.inf))
-    assert contact_f1(Touch(none, none, none, 0.05)) == 1
+        truth = contacts.gather_truth(true, BOX, judged, 10, 0.0501)
+        touch = contacts.gather_touch(judged, BOX, truth, 10, 0.0501)
+        assert contacts.contact_f1(touch) == pytest.approx(expected)
+    none = contacts.Nearness(torch.full((1, 3), torch.inf), torch.full((1, 3), torch.inf))
+    assert contacts.contact_f1(contacts.Touch(none, none, none, 0.05)) == 1
 
 
 def test_contact_f1_is_paired_by_frame_and_person_not_by_row():
     bodies = some_people(torch.cat([grid_body(1.0, 1.4), grid_body(1.04, 1.44), grid_body(2, 3)]))
     order = torch.tensor([2, 0, 1])
     shuffled = replace(bodies, verts=bodies.verts[order], frame=bodies.frame[order])
-    truth = gather_truth(shuffled, BOX, bodies, 10, 0.05)
-    assert contact_f1(gather_touch(bodies, BOX, truth, 10, 0.05)) == 1
+    truth = contacts.gather_truth(shuffled, BOX, bodies, 10, 0.05)
+    assert contacts.contact_f1(contacts.gather_touch(bodies, BOX, truth, 10, 0.05)) == 1
     later = replace(bodies, frame=bodies.frame + 1)  # frames 1, 2, 3: of the true 0, 1, 2
-    touch = gather_touch(later, BOX, truth, 10, 0.05)
+    touch = contacts.gather_touch(later, BOX, truth, 10, 0.05)
     assert touch.shared.signed.shape[0] == 2
     assert touch.near.signed.shape[0] == 3
 
@@ -81,9 +60,9 @@ def test_distances_within_reach_are_those_to_all_objects_without_culling():
     verts = torch.rand(3, 400, 3, generator=rng, dtype=F64) * 3 - 1.5
     sphere = mesh_of(trimesh.creation.icosphere(3, 0.8))
     frame = torch.arange(3)
-    solid = [StandingMesh(sphere), *BOX]
-    found = nearness(verts, frame, solid, 0.05)
-    whole = nearness(verts, frame, solid, 10.0)
+    solid = [contacts.StandingMesh(sphere), *BOX]
+    found = contacts.nearness(verts, frame, solid, 0.05)
+    whole = contacts.nearness(verts, frame, solid, 10.0)
     near = whole.surface <= 0.05
     assert near.sum() > 50
     assert torch.equal(near, found.surface <= 0.05)
@@ -96,7 +75,7 @@ def test_distances_within_reach_are_those_to_all_objects_without_culling():
 
 @given(st.integers(1, 500), st.integers(2, 100))
 def test_rows_are_thinned_evenly_and_each_at_most_once(rows, count):
-    picked = evenly(rows, count).tolist()
+    picked = contacts.evenly(rows, count).tolist()
     assert len(set(picked)) == len(picked) == min(rows, count)
     assert picked[0] == 0
     assert picked[-1] == rows - 1
@@ -107,9 +86,9 @@ def test_rows_are_thinned_evenly_and_each_at_most_once(rows, count):
 def test_soles_under_the_floor_are_counted_and_measured():
     under = torch.tensor([[0.1, 0.0, -0.005, -0.02], [0.3, -0.04, 0, 0]])
     for heights, share, depth in ((under, 2 / 8, 0.03), (torch.ones(2, 3), 0, 0)):
-        standing = Standing(heights, 0.01)
-        assert ground_penetration_frequency(standing) == pytest.approx(share)
-        assert ground_penetration_distance(standing) == pytest.approx(depth)
+        standing = errors.Standing(heights, 0.01)
+        assert errors.ground_penetration_frequency(standing) == pytest.approx(share)
+        assert errors.ground_penetration_distance(standing) == pytest.approx(depth)
 
 
 def test_procrustes_undoes_every_similarity_but_no_mirror():
@@ -118,9 +97,9 @@ def test_procrustes_undoes_every_similarity_but_no_mirror():
     turns = torch.tensor(Rotation.random(5, rng).as_matrix())
     scale = torch.tensor(rng.uniform(0.3, 3, (5, 1, 1)))
     target = scale * points @ turns.mT + torch.tensor(rng.normal(size=(5, 1, 3)))
-    assert torch.allclose(procrustes(points, target), target, atol=1e-12)
+    assert torch.allclose(errors.procrustes(points, target), target, atol=1e-12)
     mirrored = target * torch.tensor([-1.0, 1, 1])
-    assert (procrustes(points, mirrored) - mirrored).norm(dim=-1).mean() > 0.1
+    assert (errors.procrustes(points, mirrored) - mirrored).norm(dim=-1).mean() > 0.1
 
 
 def test_procrustes_finds_the_rotation_of_another_library_and_the_best_scale():
@@ -129,7 +108,7 @@ def test_procrustes_finds_the_rotation_of_another_library_and_the_best_scale():
     a, b = points - points.mean(0), target - target.mean(0)
     turn = Rotation.align_vectors(b, a)[0].as_matrix()
     scale = (b * (a @ turn.T)).sum() / (a**2).sum()
-    found = procrustes(torch.tensor(points), torch.tensor(target))
+    found = errors.procrustes(torch.tensor(points), torch.tensor(target))
     assert np.allclose(found.numpy(), scale * a @ turn.T + target.mean(0))
 
 
@@ -137,9 +116,9 @@ def test_pose_errors_are_in_the_world_and_aligned_ones_are_not():
     bodies = people(3)
     shift = torch.tensor([0.03, 0.0, 0.04])
     wrong = replace(bodies, verts=bodies.verts + shift, joints=bodies.joints + shift)
-    found = gather_twins(wrong, bodies)
-    assert (pje(found), v2v(found)) == pytest.approx((0.05, 0.05), rel=1e-4)
-    assert (p_pje(found), p_v2v(found)) == pytest.approx((0, 0), abs=1e-5)
+    found = errors.gather_twins(wrong, bodies)
+    assert (errors.pje(found), errors.v2v(found)) == pytest.approx((0.05, 0.05), rel=1e-4)
+    assert (errors.p_pje(found), errors.p_v2v(found)) == pytest.approx((0, 0), abs=1e-5)
     assert found.joints.shape == (3, 22, 3)
 
 
@@ -147,11 +126,11 @@ def test_joints_are_paired_by_name():
     bodies = people(2)
     order = torch.randperm(55, generator=torch.Generator().manual_seed(0))
     names = tuple(bodies.joint_names[i] for i in order)
-    found = gather_twins(replace(bodies, joints=bodies.joints[:, order], joint_names=names), bodies)
-    assert pje(found) == 0
+    shuffled = replace(bodies, joints=bodies.joints[:, order], joint_names=names)
+    assert errors.pje(errors.gather_twins(shuffled, bodies)) == 0
 
 
 def test_points_that_coincide_have_an_aligned_error_and_no_nan():
     same, spread = torch.zeros(1, 4, 3), torch.eye(4)[None, :, :3]
-    value = p_v2v(Twins(same, spread, None, None))
+    value = errors.p_v2v(errors.Twins(same, spread, None, None))
     assert value == pytest.approx(float((spread - spread.mean(-2)).norm(dim=-1).mean()))

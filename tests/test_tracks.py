@@ -127,9 +127,8 @@ def test_what_is_uncertain_keeps_its_number():
     others = [(f, p + 5, place) for f, p, place in near]
     assert pair_tracks(bodies_of_rows(near), masks_of(others), CAMERA).notes == ()
     alone = [(f, 0, (1.0, 0.0, 4.0)) for f in FRAMES]
-    elsewhere = [(f, 0, (-1.2, 0.0, 5.0)) for f in FRAMES] + [
-        (f, 4, place) for f, _, place in alone
-    ]
+    elsewhere = [(f, 0, (-1.2, 0.0, 5.0)) for f in FRAMES]
+    elsewhere += [(f, 4, place) for f, _, place in alone]
     pairs = pair_tracks(bodies_of_rows(alone), masks_of(elsewhere), CAMERA)
     assert (pairs.bodies, pairs.masks) == ({}, {4: 0, 0: 5})
     apart = replace(bodies_of_rows(alone), frame=torch.arange(100, 100 + len(FRAMES)))
@@ -196,7 +195,6 @@ def test_what_may_be_another_person_is_named_and_not_joined(case):
 def merged(*files: Bodies) -> tuple[Bodies, list[str]]:
     parts = [Parts("", bodies=At(bodies_to_arrays(one), f"{k}.npz")) for k, one in enumerate(files)]
     whole = functools.reduce(with_parts, parts)
-    assert whole.bodies is not None
     return bodies_of(whole.bodies, lambda _: None), list(whole.notes)
 
 

@@ -165,6 +165,17 @@ def put(tree: Any, way: Sequence[Any], value: Any) -> None:
         tree[last] = value
 
 
+def ways_of(tree: Any, way: tuple[Any, ...] = (), most: int = 10**9) -> list[tuple[Any, ...]]:
+    """The way to every value in lists and objects; in lists of `most` items only to the ends."""
+    found = [way] if way else []
+    keys: Any = tree if isinstance(tree, dict) else ()
+    if isinstance(tree, list):
+        keys = range(len(tree)) if len(tree) < most else (0, len(tree) - 1)
+    for key in keys:
+        found += ways_of(tree[key], (*way, key), most)
+    return found
+
+
 def write_obj(path: Path, verts: np.ndarray, faces: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     lines = ["v " + " ".join(map(str, v)) for v in verts.tolist()]
