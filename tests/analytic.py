@@ -81,20 +81,14 @@ def image_at(objects, layout, camera, size):
     pixels = project(verts, camera.K)
     boxes = torch.cat([pixels.amin(-2), pixels.amax(-2)], -1)
     views = crop_views(camera.K, boxes, 0.3, size)
-    drawn, _ = look(verts, Topology(objects.faces, objects.edges), views, depth=False)
+    drawn, seen = look(verts, Topology(objects.faces, objects.edges), views, depth=True)
     n = len(boxes)
     keep = torch.ones(n, size, size, dtype=torch.bool)
     return ImageCues(
         boxes, torch.full((n, 4), SEEN), views, drawn, keep, torch.ones(n).to(boxes),
         layout.t_world_object.norm(dim=-1), given=given_at(layout),
-        measured=measured_at(verts, objects, views),
+        measured=Measured(seen.nearest, torch.full((n,), 0.06).to(verts)),
     )  # fmt: skip
-
-
-def measured_at(verts, objects, views):
-    """A network that sees the objects where they are."""
-    _, seen = look(verts, Topology(objects.faces, objects.edges), views, depth=True)
-    return Measured(seen.nearest, torch.full((len(verts),), 0.06).to(verts))
 
 
 def given_at(layout):

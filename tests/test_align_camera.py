@@ -31,11 +31,6 @@ def rotation(pitch, roll):
     return tilted(torch.tensor(pitch).double(), torch.tensor(roll).double())
 
 
-def camera_off(degrees=(0.0, 0.0)):
-    pitch, roll = PITCH + math.radians(degrees[0]), ROLL + math.radians(degrees[1])
-    return Camera(K, rotation(pitch, roll).float(), 1280, 720)
-
-
 def soles_at(spots, seed=0, frames=3, noise=0.0, wrong=0.0, person=0, bias=0.0):
     """Soles on the floor of a known camera: `frames` at every (x, z), four points each."""
     rng, points = np.random.default_rng(seed), []
@@ -77,7 +72,9 @@ def errors(found):
 
 def align(soles, off, ground=None, height=None, config=ROBUST, **more):
     """From a camera that is so many degrees off."""
-    return align_camera(AlignInputs(soles, camera_off(off), ground, height, **more), config)
+    pitch, roll = PITCH + math.radians(off[0]), ROLL + math.radians(off[1])
+    camera = Camera(K, rotation(pitch, roll).float(), 1280, 720)
+    return align_camera(AlignInputs(soles, camera, ground, height, **more), config)
 
 
 def spread_of(found):

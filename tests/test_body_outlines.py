@@ -29,13 +29,10 @@ def drawn(seen: SeenBodies) -> torch.Tensor:
     return layers(seen.verts, seen.faces, Crops(K[None], 480, 640)).front[0].isfinite()
 
 
-def table_of(mask: torch.Tensor | None) -> MaskTable:
-    masks = encode([(NOTHING < 0 if mask is None else mask).numpy()])
-    return MaskTable(masks, (None if mask is None else 0,), ((),))
-
-
 def wish(seen: SeenBodies, mask: torch.Tensor | None) -> Outline:
-    return gather_outlines(seen, table_of(mask), torch.tensor([0]))
+    masks = encode([(NOTHING < 0 if mask is None else mask).numpy()])
+    table = MaskTable(masks, (None if mask is None else 0,), ((),))
+    return gather_outlines(seen, table, torch.tensor([0]))
 
 
 def step(outline: Outline) -> torch.Tensor:

@@ -63,18 +63,10 @@ WALL = Surface(torch.zeros(1, 3), UP, ONE.long(), ONE)
 def still_people(turns, count=1, at=(0.0, -3.0), lift=0.0, fps=5.0):
     """People in one posture, with joints, their feet on the floor but for `lift`."""
     bodies = people(pose(turns, count), fps, GROUND + lift)
-    shift = torch.tensor([at[0], 0.0, at[1]]) + (bodies.verts[:, :1] * 0)[0, 0]
-    move = bodies.verts[0, 0] - puppet_verts(bodies)[0, 0] + shift
+    puppet = puppet_of(bodies, torch.arange(bodies.verts.shape[1]))
+    move = bodies.verts[0, 0] - puppet.skin[0, 0] + torch.tensor([at[0], 0.0, at[1]])
     placed = replace(bodies.pose, transl=bodies.pose.transl + move)
-    return corrected(replace(bodies, pose=placed), nothing(count))
-
-
-def puppet_verts(bodies):
-    return puppet_of(bodies, torch.arange(bodies.verts.shape[1])).skin
-
-
-def nothing(count):
-    return Correction(torch.zeros(count, 3), torch.zeros(count, 3), torch.zeros(count, 63))
+    return corrected(replace(bodies, pose=placed), no_correction(puppet))
 
 
 def room_with(bodies, *boxes):

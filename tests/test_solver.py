@@ -68,12 +68,6 @@ def valleys(n, seed=0):
     return Problems(of, start, (n,))
 
 
-def only(problems, k):
-    """One of the problems, alone."""
-    start = Point(problems.start.x[k : k + 1], problems.start.y[k : k + 1])
-    return Problems(lambda rows: problems.of(rows + k), start, (1,))
-
-
 def test_duplicates_are_solved_once():
     some, like = valleys(4), torch.tensor([0, 1, 0, 3, 1, 3])
     start = Point(some.start.x[like], some.start.y[like])
@@ -110,10 +104,10 @@ def test_the_end_of_each_of_rosenbrocks_valleys_is_found():
 
 @pytest.mark.parametrize("k", [0, 3, 11])
 def test_a_problem_goes_its_way_whatever_else_is_in_the_batch(k):
-    together, one = (
-        minimize_batched(valleys(12), BatchedBFGS()),
-        minimize_batched(only(valleys(12), k), BatchedBFGS()),
-    )
+    many = valleys(12)
+    start = Point(many.start.x[k : k + 1], many.start.y[k : k + 1])
+    alone = Problems(lambda rows: many.of(rows + k), start, (1,))
+    together, one = (minimize_batched(some, BatchedBFGS()) for some in (many, alone))
     torch.testing.assert_close(one.at.x[0], together.at.x[k], rtol=0, atol=1e-6)
     torch.testing.assert_close(one.value[0], together.value[k], rtol=1e-6, atol=1e-9)
 

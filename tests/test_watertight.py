@@ -37,10 +37,6 @@ def inside_out(mesh: Mesh) -> Mesh:
     return Mesh(mesh.verts, mesh.faces.flip(-1))
 
 
-def double_sided(mesh: Mesh) -> Mesh:
-    return joined(mesh, inside_out(mesh))
-
-
 def chair() -> list[Mesh]:
     legs = [block((0.05, 0.45, 0.05), (x, 0.225, z)) for x in (-0.2, 0.2) for z in (-0.2, 0.2)]
     return [
@@ -149,7 +145,8 @@ def test_double_sided_sheets_become_thin_solids():
     top = as_mesh(sheet)
     up = m.face_normals(top.verts, top.faces)[:, 1] > 0
     seat = Mesh(top.verts + torch.tensor([0, 0.4, 0]), top.faces[up])
-    soup = double_sided(joined(seat, *chair()))
+    soup = joined(seat, *chair())
+    soup = joined(soup, inside_out(soup))
     soup = Mesh(soup.verts, soup.faces[torch.from_numpy(rng.permutation(len(soup.faces)))])
     closed = close_mesh(soup)
     check(soup, closed)
