@@ -94,15 +94,8 @@ PEOPLE = (
     TableRow("+ CamGP + SDF + Contact", "people-contact"),
 )  # fmt: skip
 """Tab. 5: bodies refined in the estimated room, below the fits that the user's copy has."""
-LONGER = tuple(
-    TableRow(
-        f"{s} s",
-        f"length-{s}-",
-        "full",
-        f"{SEGMENTS} segments of each recording, evenly spread; std: theirs, mean over recordings",
-    )
-    for s in LENGTHS
-)
+_SPREAD = "segments of each recording, evenly spread; std: theirs, mean over recordings"
+LONGER = tuple(TableRow(f"{s} s", f"length-{s}-", "full", f"{SEGMENTS} {_SPREAD}") for s in LENGTHS)
 DISTURBED = tuple(
     TableRow(f"{kind} ± {level:g}", f"noise-{kind}-{level:g}", "full", "uniform noise, one draw")
     for kind, levels in NOISES.items()

@@ -17,10 +17,10 @@ class RoomSet:
     """Rooms of one kind, with one kind of noise."""
 
     about: str  #: what it holds, in a sentence
-    seeds: str  #: Held-out rooms, for results: `1000-1029`
-    development: str  #: rooms to choose settings on; none is held out
     room: RoomConfig = field(default_factory=RoomConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
+    seeds: str = "1000-1029"  #: held-out rooms, for results
+    development: str = "100-129"  #: rooms to choose settings on; none is held out
     withheld: Literal["seat"] | None = None  #: what no detector saw: `rooms.noise.without_seat`
     paths: tuple[PathConfig, ...] = (PathConfig(),)
     """How the camera moves, one room after the other."""
@@ -63,58 +63,43 @@ _SLAM = PathConfig(shake=0.7, units=1.6, drift=0.01, drift_turn=0.5)
 SETS: dict[str, RoomSet] = {
     "mini": RoomSet(
         "Small pictures of little rooms with a short visit: a test that takes seconds.",
-        "1000-1002", "100-101", _SMALL,
-    ),
-    "rooms": RoomSet(
-        "A person uses the furniture of a room: the standard set.",
-        "1000-1029", "100-129",
-    ),
-    "two": RoomSet(
-        "Two people use one room.",
-        "1000-1019", "100-129", RoomConfig(people=2),
-    ),
+        _SMALL, seeds="1000-1002", development="100-101"),
+    "rooms": RoomSet("A person uses the furniture of a room: the standard set."),
+    "two": RoomSet("Two people use one room.", RoomConfig(people=2), seeds="1000-1019"),
     "wrong-shape": RoomSet(
         "The rooms of `rooms`; every mesh that is given is another object of the same class.",
-        "1000-1029", "100-129", noise=NoiseConfig(other_shapes=1.0),
-    ),
+        noise=NoiseConfig(other_shapes=1.0)),
     "clutter": RoomSet(
         "More furniture, seen by a lower and narrower camera: objects occlude each other and are"
         " cut by the border of the image.",
-        "1000-1029", "100-129", _CROWDED,
-    ),
+        _CROWDED),
     "detected": RoomSet(
         "The rooms of `rooms`; masks and boxes as a detector gives them, with objects missed,"
         " invented, merged and called by wrong names.",
-        "1000-1029", "100-129", noise=_DETECTED,
-    ),
+        noise=_DETECTED),
     "upstream": RoomSet(
         "The rooms of `rooms` as today's tools would give them, all errors at once: foreign meshes,"
         " masks of a coarse head, mean bodies with biased poses, a guessed lens.",
-        "1000-1029", "100-129", noise=_UPSTREAM,
-    ),
+        noise=_UPSTREAM),
     "askew": RoomSet(
         "The rooms of `rooms` with each object turned 3 to 15 degrees away from the walls, under a"
         " guessed lens.",
-        "1000-1029", "100-129", RoomConfig(plan=PlanConfig(askew=(3.0, 15.0))),
-        NoiseConfig(lens=0.055),
-    ),
+        RoomConfig(plan=PlanConfig(askew=(3.0, 15.0))),
+        NoiseConfig(lens=0.055)),
     "moved": RoomSet(
         "Two people use a room one after the other; between them a chair or a table is moved.",
-        "1000-1029", "100-129", _MOVED,
-    ),
+        _MOVED),
     "withheld-seat": RoomSet(
         "The rooms of `rooms`; the seat that is used most is missing from the input.",
-        "1000-1029", "100-129", withheld="seat",
-    ),
+        withheld="seat"),
     "moving": RoomSet(
         "The rooms of `rooms` seen by a camera that is walked with, panned or held by hand; its"
         " path is as SLAM gives it, in a scale of its own and with a drift of 1 % of the way.",
-        "1000-1029", "100-129", paths=(
+        paths=(
             replace(_SLAM, travel=0.8, turn=5.0, hand=0.01),
             replace(_SLAM, travel=0.1, turn=12.0, hand=0.01),
             replace(_SLAM, travel=0.05, turn=1.0, hand=0.015),
-        ),
-    ),
+        )),
 }  # fmt: skip
 """All sets by name."""
 

@@ -103,9 +103,7 @@ def _rounded(path: Floor) -> Floor:
 def steps_of(way: Stations) -> Steps:
     """Alternate feet on the stations, then bring the other foot beside the last."""
     places, headings = way.place, way.heading
-    first = 0 if headings[-1] >= headings[0] else 1
-    if len(places) > 1:
-        first = 0 if headings[1] >= headings[0] else 1
+    first = 0 if headings[min(1, len(places) - 1)] >= headings[0] else 1
     order = [(first + k) % 2 for k in range(len(places))]
     last = len(places) - 1
     rows = [(0, 0), (1, 0), *((order[k], k + 1) for k in range(last)), (order[last], last)]

@@ -373,41 +373,24 @@ FALLING = 0.3  # [m], a centre of mass farther out is held by something else
 
 BODY_TERMS: tuple[Term[Any], ...] = (
     # E_Body, of bodies that are fitted to keypoints; in camera axes
-    Term(
-        "keypoints", lambda b: keypoint_term(b.pixels, b.seen.pixels, b.seen.weight, b.rho),
-        ("pixels",),
-    ),
-    Term(
-        "smooth_joints",
-        lambda b: motion_term(
-            b.sized, b.motion.near, b.motion.expected[:, None], SIGMA_JOINTS),
-        ("motion",),
-    ),
-    Term(
-        "smooth_pixels",
-        lambda b: motion_term(b.pixels, b.motion.near, 1 / b.weight_between, SIGMA_PIXELS),
-        ("motion",),
-    ),
-    Term(  # a body along the view; not robust, since a single frame is off by a metre
-        "still", lambda b: motion_term(b.sized[:, :1], b.motion.near, b.motion.calm[:, :1]),
-        ("motion",),
-    ),
-    Term(  # single frames hardly constrain the depth of an arm, either
-        "held", lambda b: motion_term(
-            b.sized[:, b.upper] - b.sized[:, :1], b.motion.near, b.motion.calm[:, b.upper],
-            SIGMA_HELD),
-        ("motion",),
-    ),
-    Term(
-        "support",
-        lambda b: support_term(torch.cat([b.points.joints, b.points.keypoints], 1), *b.plane),
-        ("plane",),
-    ),
+    Term("keypoints", lambda b: keypoint_term(b.pixels, b.seen.pixels, b.seen.weight, b.rho),
+         ("pixels",)),
+    Term("smooth_joints", lambda b: motion_term(
+        b.sized, b.motion.near, b.motion.expected[:, None], SIGMA_JOINTS), ("motion",)),
+    Term("smooth_pixels", lambda b: motion_term(
+        b.pixels, b.motion.near, 1 / b.weight_between, SIGMA_PIXELS), ("motion",)),
+    # A body along the view; not robust, since a single frame is off by a metre.
+    Term("still", lambda b: motion_term(b.sized[:, :1], b.motion.near, b.motion.calm[:, :1]),
+         ("motion",)),
+    # Single frames hardly constrain the depth of an arm, either.
+    Term("held", lambda b: motion_term(
+        b.sized[:, b.upper] - b.sized[:, :1], b.motion.near, b.motion.calm[:, b.upper],
+        SIGMA_HELD), ("motion",)),
+    Term("support", lambda b: support_term(
+        torch.cat([b.points.joints, b.points.keypoints], 1), *b.plane), ("plane",)),
     Term("stands", lambda b: robust_square(b.sole_height.square(), STEP), ("free_floor",)),
-    Term(
-        "balance", lambda b: b.seen.standing * robust_square(b.falling, FALLING),
-        ("free_floor", "standing"),
-    ),
+    Term("balance", lambda b: b.seen.standing * robust_square(b.falling, FALLING),
+         ("free_floor", "standing")),
     Term("level", lambda b: b.slope, ("free_floor",)),
     Term("lies", lambda b: b.away_from_lying.square(), ("about",)),
     Term("pose", lambda b: deviation_term(*b.off_pose), ("pixels",)),
@@ -415,17 +398,12 @@ BODY_TERMS: tuple[Term[Any], ...] = (
     Term("bending", lambda b: b.bent.exp().square().sum(-1), ("pixels",)),
     Term("shape", lambda b: b.shape, ("pixels",)),
     Term("height", lambda b: b.off_height, ("stature",)),
-    Term(
-        "offset", lambda b: deviation_term(
-            b.at.offset.flatten(1), b.seen.lasting.repeat_interleave(3))[b.frame.person] / b.same,
-        ("lasting",),
-    ),
+    Term("offset", lambda b: deviation_term(
+        b.at.offset.flatten(1), b.seen.lasting.repeat_interleave(3))[b.frame.person] / b.same,
+        ("lasting",)),
     Term("hands", lambda b: deviation_term(b.at.hands), ("hands",)),
-    Term(
-        "jaw", lambda b: (
-            deviation_term(b.at.face[:, :1]) + 100 * deviation_term(b.at.face[:, 1:3])),
-        ("face",),
-    ),
+    Term("jaw", lambda b: (
+        deviation_term(b.at.face[:, :1]) + 100 * deviation_term(b.at.face[:, 1:3])), ("face",)),
     Term("expression", lambda b: deviation_term(b.at.face[:, 3:]), ("face",)),
     # The refinement of given bodies in a room; in its world
     Term("angles", lambda b: 0.5 * deviation_term(b.angles, ANGLE), ("given",)),
@@ -438,14 +416,10 @@ BODY_TERMS: tuple[Term[Any], ...] = (
     Term("lock", lambda b: lock_term(b.feet[0], b.known.rest, b.known.near), ("feet",)),
     Term("sink", lambda b: sink_term(b.even, b.known.furniture), ("furniture",)),
     Term("touch", lambda b: touch_term(b.now.skin, b.known.matches, b.known.rho), ("matches",)),
-    Term(
-        "order", lambda b: order_term(b.in_camera(b.even)[..., 2], b.known.bounds), ("bounds",),
-    ),
-    Term(
-        "outline", lambda b: outline_term(
-            b.in_camera(b.now.skin), b.known.outline, b.known.camera.K, b.known.camera.width),
-        ("outline",),
-    ),
+    Term("order", lambda b: order_term(b.in_camera(b.even)[..., 2], b.known.bounds), ("bounds",)),
+    Term("outline", lambda b: outline_term(
+        b.in_camera(b.now.skin), b.known.outline, b.known.camera.K, b.known.camera.width),
+        ("outline",)),
 )  # fmt: skip
 """All terms of the energy of bodies; a new one is a function, a weight and a row."""
 
