@@ -180,6 +180,7 @@ def winding(verts: np.ndarray, faces: np.ndarray, shape: np.ndarray) -> np.ndarr
 
 
 REACH = 2  # [cells], that the shell reaches out of the body
+FAR = 1e6  # [cells]
 SLIVER = 1e-9  # squared sine of an angle below which a triangle has no area
 
 
@@ -260,9 +261,12 @@ def add_body(
     body.low, body.size = wp.vec3i(*low.tolist()), wp.vec3i(*size)
     steps = torch.zeros(*shape[:2], shape[2] + 1, dtype=torch.int32, device=device)
     body.winding = array(steps, "int32")
+    near = torch.full(shape, FAR, device=device)
+    body.near = array(near, "float32")
     at = place.float()
     wp.copy(mesh.points, array(at, "vec3"))
     mesh.refit()
     field = array(volume.values, "float32")
     launch(bodies.cross, len(corners), [body], device)
+    launch(bodies.surround, len(corners), [body], device)
     launch(bodies.lower, shape[:2], [body, mesh.id, side, field, volume.cell], device)

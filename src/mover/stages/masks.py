@@ -13,7 +13,7 @@ from torch.nn.functional import interpolate, max_pool2d
 from mover.core.types import Bodies, Camera, Masks, People
 from mover.energy.image_terms import WIDTH
 from mover.geometry.camera import project
-from mover.geometry.raster import Crops, layers
+from mover.geometry.raster import Crops, fronts
 from mover.geometry.rle import decode, thinned
 from mover.geometry.warp_start import mapped
 
@@ -114,7 +114,7 @@ def compare_extents(
         last = pixels.new_tensor([camera.width - 2, camera.height - 2])
         if not bool((verts[:, 2] > 0).all() & ((pixels > 2) & (pixels < last)).all()):
             return math.nan
-        drawn = layers(verts[None].float(), bodies.faces, views).front.isfinite()[0]
+        drawn = fronts(verts[None].float(), bodies.faces, views).isfinite()[0]
         high, wide = _extent(drawn)
         if high <= UPRIGHT * wide:
             return math.nan

@@ -10,6 +10,8 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 SHELL = wp.constant(2.0)  # [cells], see `volume.SHELL`
 FAR = wp.constant(1.0e6)
+TINY = wp.constant(1.0e-12)
+SLIVER = wp.constant(3.2e-5)  # sine of an angle below which a triangle has no area
 MORE = wp.constant(0.001)  # [cells], far more than the rounding of a distance
 SNAP = wp.constant(wp.float64(65536.0))  # vertices snap to this part of a cell, for exact crossings
 BITS = wp.constant(wp.int64(16))
@@ -24,6 +26,7 @@ class Body:
     size: wp.vec3i  #: places of the box
     low: wp.vec3i  #: its first place in the volume
     winding: wp.array3d(dtype=wp.int32)  #: at first its changes along y, with one place more
+    near: wp.array3d(dtype=wp.float32)  #: distance to the surface, exact within the shell
 
 
 @wp.struct
@@ -99,11 +102,59 @@ def cross(b: Body) -> None:
                 wp.atomic_add(b.winding, x, z, wp.clamp(y, 0, b.size[1]), r.sign)
 
 
+@wp.func
+def toward(p: wp.vec3, a: wp.vec3, b: wp.vec3) -> wp.vec3:
+    """From a point to the nearest one of an edge."""
+    edge = b - a
+    share = wp.dot(p - a, edge) / wp.max(wp.dot(edge, edge), TINY)
+    return a + wp.clamp(share, 0.0, 1.0) * edge - p
+
+
+@wp.kernel
+def surround(b: Body) -> None:
+    """Distances to a triangle from all places within the shell about it."""
+    t = b.faces[wp.tid()]
+    p = wp.vec3(b.place[t[0]])
+    q = wp.vec3(b.place[t[1]])
+    r = wp.vec3(b.place[t[2]])
+    normal = wp.cross(q - p, r - p)
+    area = wp.length(normal)  # twice
+    if area <= SLIVER * wp.length(q - p) * wp.length(r - p):
+        return
+    normal = normal / area
+    low = wp.min(p, wp.min(q, r))
+    high = wp.max(p, wp.max(q, r))
+    xl = wp.max(int(wp.ceil(low[0] - SHELL)), 0)
+    yl = wp.max(int(wp.ceil(low[1] - SHELL)), 0)
+    zl = wp.max(int(wp.ceil(low[2] - SHELL)), 0)
+    xh = wp.min(int(wp.floor(high[0] + SHELL)), b.size[0] - 1)
+    yh = wp.min(int(wp.floor(high[1] + SHELL)), b.size[1] - 1)
+    zh = wp.min(int(wp.floor(high[2] + SHELL)), b.size[2] - 1)
+    for x in range(xl, xh + 1):
+        for z in range(zl, zh + 1):
+            for y in range(yl, yh + 1):
+                at = wp.vec3(float(x), float(y), float(z))
+                height = wp.abs(wp.dot(at - p, normal))
+                held = b.near[x, z, y]
+                if height < wp.min(held, SHELL):
+                    u = wp.dot(wp.cross(q - p, at - p), normal)
+                    v = wp.dot(wp.cross(r - q, at - q), normal)
+                    w = wp.dot(wp.cross(p - r, at - r), normal)
+                    distance = height
+                    if wp.min(u, wp.min(v, w)) < 0.0:
+                        edge = wp.min(
+                            wp.length_sq(toward(at, p, q)),
+                            wp.min(wp.length_sq(toward(at, q, r)), wp.length_sq(toward(at, r, p))),
+                        )
+                        distance = wp.sqrt(edge)
+                    wp.atomic_min(b.near, x, z, y, distance)
+
+
 @wp.kernel
 def lower(
     b: Body, mesh: wp.uint64, side: int, field: wp.array3d(dtype=wp.float32), cell: float
 ) -> None:
-    """Lower the volume along a column, from the nearest point of Warp's mesh.
+    """Lower the volume along a column; deep inside from the nearest point of Warp's mesh.
 
     Distances change by one cell from place to place at most, which bounds the next search.
     """
@@ -114,12 +165,16 @@ def lower(
         winding += b.winding[x, z, y] * side
         at = b.low + wp.vec3i(x, y, z)
         held = field[at[0], at[1], at[2]]
-        p = wp.vec3(float(x), float(y), float(z))
-        most = wp.where(winding > 0, reach + 1.0 + MORE, SHELL)
-        reach = FAR
-        if winding > 0 or held > -SHELL * cell:
-            q = wp.mesh_query_point_no_sign(mesh, p, most)
-            if q.result:
-                reach = wp.length(wp.mesh_eval_position(mesh, q.face, q.u, q.v) - p)
-                signed = wp.where(winding > 0, -reach, reach) * cell
-                field[at[0], at[1], at[2]] = wp.min(held, signed)
+        near = b.near[x, z, y]
+        if winding > 0:
+            reach = wp.min(near, reach + 1.0 + MORE)
+            if near > SHELL and reach > -held / cell:
+                p = wp.vec3(float(x), float(y), float(z))
+                q = wp.mesh_query_point_no_sign(mesh, p, reach)
+                if q.result:
+                    reach = wp.length(wp.mesh_eval_position(mesh, q.face, q.u, q.v) - p)
+            field[at[0], at[1], at[2]] = wp.min(held, -reach * cell)
+        else:
+            reach = FAR
+            if near <= SHELL:
+                field[at[0], at[1], at[2]] = wp.min(held, near * cell)

@@ -17,7 +17,7 @@ from mover.energy.body_terms import OUTLINE_POINTS, Bounds, Outline, Sighting, b
 from mover.geometry.camera import project, to_camera
 from mover.geometry.mesh import sample_surface
 from mover.geometry.placement import place_object
-from mover.geometry.raster import Crops, first_hit, layers
+from mover.geometry.raster import Crops, first_hit, fronts
 from mover.geometry.volume import Volume, grid_around, union_bodies
 from mover.stages.contacts.assign_contacts import evenly
 from mover.stages.masks import MaskTable, small_camera, small_masks, widened
@@ -267,7 +267,7 @@ def gather_outlines(seen: SeenBodies, table: MaskTable, rows: Int[Tensor, " bodi
         part = slice(first, first + 64)
         some = replace(seen, verts=seen.verts[part], skin=seen.skin[part])
         views, corner = _windows(some)
-        drawn = layers(some.verts.float(), seen.faces, views).front
+        drawn = fronts(some.verts.float(), seen.faces, views)
         for k, row in enumerate(rows[part].tolist()):  # masks are decoded one by one
             if table.own[row] is None:
                 continue

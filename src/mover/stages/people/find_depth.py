@@ -27,7 +27,7 @@ from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
 from mover.core.types import Bodies, Camera, People
 from mover.geometry.camera import project
-from mover.geometry.raster import Crops, layers
+from mover.geometry.raster import Crops, fronts
 from mover.geometry.warp_start import mapped
 from mover.stages.camera.find_foot_contacts import straight_legs
 from mover.stages.config import DepthConfig
@@ -294,4 +294,4 @@ def _drawn(
     shrink = torch.tensor([width / camera.width, height / camera.height, 1.0]).diag()
     K = (shrink @ camera.K.float()).expand(len(factors), 3, 3)
     verts = bodies.verts[row] + shift[:, None]
-    return layers(verts.float(), bodies.faces, Crops(K, height, width)).front.isfinite()
+    return fronts(verts.float(), bodies.faces, Crops(K, height, width)).isfinite()
