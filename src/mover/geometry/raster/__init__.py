@@ -77,21 +77,14 @@ def layers(
     `exit` is the nearest back-facing surface. Where a body cuts into itself (a hand in the hip) the
     ray may still be inside another part there: the bound is conservative, never too deep.
     """
-    back = _nearest(verts_cam, faces.flip(-1), views)  # backs drawn as fronts
-    return Layers(
-        _nearest(verts_cam, faces, views), torch.where(back < torch.inf, back, -torch.inf)
-    )
+    back = fronts(verts_cam, faces.flip(-1), views)  # backs drawn as fronts
+    return Layers(fronts(verts_cam, faces, views), torch.where(back < torch.inf, back, -torch.inf))
 
 
 def fronts(
     verts_cam: Float[Tensor, "items verts 3"], faces: Int[Tensor, "faces 3"], views: Crops
 ) -> Float[Tensor, "items h w"]:
     """Where rays enter closed bodies of one topology [m]; inf where they miss."""
-    return _nearest(verts_cam, faces, views)
-
-
-def _nearest(verts_cam: Tensor, faces: Tensor, views: Crops) -> Tensor:
-    """The nearest surface that faces the camera, items cut where there are too many."""
     points = verts_cam.detach().float().cpu()
     size = (len(points), views.height, views.width)
     most = max(1, MOST // max(views.height * views.width, points.shape[1], 1))
