@@ -23,7 +23,7 @@ from mover.io.capture.folder import read_capture
 from mover.io.capture.merge import import_into
 from mover.io.capture.parts import Parts
 from mover.io.masks.instance_files import read_instances
-from mover.io.masks.instances import Instance, fitted
+from mover.io.masks.instances import Instance
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 WORDS = ["chair", "couch", "chair", "person"]
@@ -103,11 +103,11 @@ def test_names_of_the_user_win(tmp_path):
 
 def test_masks_of_another_size_are_stretched_and_of_another_shape_refused(tmp_path):
     files = layouts.write_masks(tmp_path / "in", drawn(), WORDS)
-    found = fitted(read_instances(files["npz"], {}, None), (128, 96))
+    found = read_instances(files["npz"], {}, None).fitted((128, 96))
     mask = drawn_of(found.items[0], 96, 128)
     assert (mask == np.kron(drawn()[0], np.ones((2, 2), dtype=bool))).all()
     with pytest.raises(InputError, match="64 x 48"):
-        fitted(read_instances(files["npz"], {}, None), (128, 128))
+        read_instances(files["npz"], {}, None).fitted((128, 128))
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the shared data is not here")

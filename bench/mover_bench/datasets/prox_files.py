@@ -20,7 +20,7 @@ from mover.core.types import Bodies, Camera, Masks
 from mover.geometry.rle import area
 from mover.geometry.rotations import affine
 from mover.io.files.fields import At, read_json, reason
-from mover.io.masks.instances import Instance, Instances, code_of, people_tree
+from mover.io.masks.instances import Instance, Instances, code_of
 from mover.io.people.values import frame_numbers
 from mover.io.scenes.placing import Matrix
 
@@ -206,7 +206,7 @@ def body_indices(
 def people_of(masks: Mapping[int, Instance | None], fps: float | None) -> At | None:
     """The fields of people.json; None where no frame has a person; stills have no `fps`."""
     items = tuple(person for person in masks.values() if person is not None)
-    return people_tree(Instances(items, SIZE, "BodyIndexColor"), fps) if items else None
+    return Instances(items, SIZE, "BodyIndexColor").people_tree(fps) if items else None
 
 
 def pixels_of(masks: Mapping[int, Instance | None], frame: int) -> float:

@@ -30,7 +30,7 @@ from mover.io.files.cameras import read_camera_file
 from mover.io.files.fields import At, read_json
 from mover.io.files.npz import read_npy
 from mover.io.masks.instance_files import list_instances
-from mover.io.masks.instances import Instance, Instances, fitted, is_person, people_tree
+from mover.io.masks.instances import Instance, Instances
 from mover.io.scenes.placing import FLIP, Matrix, level_of, load_from, posed
 from mover.io.scenes.total3d import read_shape, total3d_parts
 from mover_bench.datasets.true_boxes import (
@@ -188,12 +188,12 @@ def _people(folder: Path, home: Path, size: tuple[int, int]) -> At | None:
     start = 1 if int(paths[0].parent.name) == 1 else 0
     first: dict[int, Instance] = {}
     for path in paths:
-        seen = fitted(list_instances(read_json(path), {}, size), size)
+        seen = list_instances(read_json(path), {}, size).fitted(size)
         frame = int(path.parent.name) - start
-        one = next((item for item in seen.items if is_person(item)), None)
+        one = next((item for item in seen.items if item.is_person), None)
         if one is not None:
             first[frame] = dataclasses.replace(one, frame=frame, track=0)
-    return people_tree(Instances(tuple(first.values()), size, paths[0].parent.parent.name))
+    return Instances(tuple(first.values()), size, paths[0].parent.parent.name).people_tree()
 
 
 def _authors(folder: Path, parts: Parts, R: Matrix | None, notes: list[str]) -> dict[str, Scene]:

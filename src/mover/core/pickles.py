@@ -336,11 +336,7 @@ def _dtype(_: str, args: list[Any], state: Any, __: object) -> np.dtype[Any]:  #
 
 
 def _filled(raw: Any, dtype: Any, shape: Any, order: Any) -> Any:  # noqa: ANN401
-    """The array of these bytes, or the nested list of these objects.
-
-    Raises:
-        ValueError: If they are not as many as the shape says.
-    """
+    """The array of these bytes, or the nested list of these objects, as many as the shape says."""
     whole = isinstance(shape, list) and all(type(n) is int and n >= 0 for n in shape)
     if not isinstance(dtype, np.dtype) or not whole or len(shape) > 32:
         raise ValueError("an array without type, or with an odd shape")
@@ -383,11 +379,7 @@ def _sparse(name: str, _: object, state: Any, __: object) -> Any:  # noqa: ANN40
 
 
 def _chumpy(name: str, _: object, state: Any, __: object) -> np.ndarray:  # noqa: ANN401
-    """The array in an object of chumpy: its value, or a selection from, a new shape of another's.
-
-    Raises:
-        InputError: If it is computed from others in another way.
-    """
+    """The array in an object of chumpy: its value, or a selection, a new shape of another's."""
     match state:
         case {"x": np.ndarray() as value}:
             return value

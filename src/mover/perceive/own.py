@@ -19,7 +19,7 @@ from mover.core.types import Keypoints, Masks, People
 from mover.geometry.rle import decode, encode
 from mover.io.formats import names
 from mover.io.masks.instance_files import read_people, read_things
-from mover.io.masks.instances import Instance, Instances, objects_tree
+from mover.io.masks.instances import Instance, Instances
 from mover.io.people.found import Known
 from mover.io.people.keypoints import keypoints_from, read_keypoints
 from mover.perceive.steady import Drift, moved, warp
@@ -121,7 +121,7 @@ def own_objects(own: Own, clip: Clip, drift: Drift) -> dict[str, Any]:
     if own.objects_frame is not None:
         frame = int((clip.in_source - own.objects_frame).abs().argmin())
         items = [_moved_item(item, drift.H[frame], size) for item in items]
-    tree = objects_tree(Instances(tuple(items), size, found.file), items).value
+    tree = Instances(tuple(items), size, found.file).objects_tree().value
     return {**tree, "images": [{**tree["images"][0], "file_name": "reference.png"}]}
 
 

@@ -199,7 +199,7 @@ def _masks(args: ImportArgs, parts: "Sequence[Parts]", hints: "Hints") -> "list[
     from mover.io.capture.parts import Parts
     from mover.io.files.images import image_size
     from mover.io.masks.instance_files import read_people, read_things
-    from mover.io.masks.instances import objects_tree, people_tree, with_reference_people
+    from mover.io.masks.instances import with_reference_people
 
     camera = next((p.camera for p in reversed(parts) if p.camera is not None), hints.camera)
     size = None if camera is None else (camera.value.get("w"), camera.value.get("h"))
@@ -209,11 +209,11 @@ def _masks(args: ImportArgs, parts: "Sequence[Parts]", hints: "Hints") -> "list[
     if args.objects_masks is not None:
         picture = "" if args.image is None else args.image.name
         masks = read_things(args.objects_masks, hints.names, shape, picture, fit=size)
-        tree = objects_tree(masks, masks.items)
+        tree = masks.objects_tree()
         found.append(Parts(name="", objects=tree, notes=masks.notes))
     if args.people_masks is not None:
         masks = read_people(args.people_masks, hints.names, shape, size)
-        found.append(Parts(name="", people=people_tree(masks, args.fps), notes=masks.notes))
+        found.append(Parts(name="", people=masks.people_tree(args.fps), notes=masks.notes))
     if args.reference_people is not None:
         masks = read_things(args.reference_people, hints.names, shape, fit=size, people=True)
         people = next((p.people for p in reversed([*parts, *found]) if p.people is not None), None)

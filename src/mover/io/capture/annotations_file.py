@@ -206,12 +206,6 @@ def furniture_of(
     return found
 
 
-def furniture_to_json(furniture: People) -> dict[str, Any]:
-    """The content of furniture.json."""
-    tree = people_to_json(furniture, None, None, ())
-    return {**tree, "categories": [{"id": 1, "name": "object"}]}
-
-
 def people_to_json(
     people: People | None, reference: Masks | None, fps: float | None, frames: Iterable[int]
 ) -> dict[str, Any]:

@@ -11,8 +11,9 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mover.core.types import Camera, Capture, Mesh
+from mover.core.types import Camera, Capture, Masks, Mesh, People
 from mover.geometry.rle import encode, tight_box
+from mover.io.capture.annotations_file import people_to_json
 from mover.io.capture.build import build_capture
 from mover.io.capture.parts import Parts
 from mover.io.capture.scene_file import scene_tree
@@ -142,7 +143,7 @@ def _annotations(objects: Sequence[ObjectArrays]) -> dict[str, Any]:
                 field = At(o.mask, FILE, f"objects[{i}].mask")
                 field.refuse("a mask with pixels", "an empty mask")
             box = tight_box(mask).tolist() if box is None else box
-            row["segmentation"] = _code(mask)
+            row["segmentation"] = {"size": list(mask.shape), "counts": encode(mask)}
         x, y, right, bottom = At(np.asarray(box), FILE, f"objects[{i}].box").array((4,)).tolist()
         score = np.asarray(o.score).tolist()
         rows.append({**row, "bbox": [x, y, right - x, bottom - y], "score": score})
@@ -157,29 +158,24 @@ def _masks(value: Numbers, field: str, axes: str) -> Tensor:
     return torch.from_numpy(given)
 
 
-def _code(mask: Tensor) -> dict[str, Any]:
-    """COCO's run-length code of a mask."""
-    return {"size": list(mask.shape), "counts": encode(mask)}
-
-
 def _people(people: PeopleArrays) -> dict[str, Any]:
     """The content of people.json."""
-    masks, hidden = _masks(people.masks, "people.masks", "rows, h, w"), people.reference
-    frames, persons = (
-        At(np.asarray(value), FILE, f"people.{name}").array((len(masks),), "whole").tolist()
+    masks, hidden = _coded(people.masks, "people.masks"), None
+    frame, person = (
+        torch.from_numpy(At(np.asarray(value), FILE, f"people.{name}").indices(len(masks.counts)))
         for name, value in (("frame", people.frame), ("person", people.person))
     )
+    if people.reference is not None:
+        hidden = _coded(people.reference, "people.reference")
     heights = {} if people.heights is None else At(people.heights, FILE, "people.heights").mapping()
-    behind = () if hidden is None else _masks(hidden, "people.reference", "rows, h, w")
-    return {
-        "info": {"heights": heights},
-        "images": [{"id": frame} for frame in dict.fromkeys(frames)],
-        "annotations": [
-            {"image_id": frame, "track_id": person, "segmentation": _code(mask)}
-            for frame, person, mask in zip(frames, persons, masks, strict=True)
-        ],
-        "reference_people": [{"segmentation": _code(mask)} for mask in behind],
-    }
+    tree = people_to_json(People(masks, frame, person, {}), hidden, None, ())
+    return {**tree, "info": {"heights": heights}}
+
+
+def _coded(value: Numbers, field: str) -> Masks:
+    """The run-length codes of several masks."""
+    masks = _masks(value, field, "rows, h, w")
+    return Masks(masks.shape[1], masks.shape[2], tuple(encode(mask) for mask in masks))
 
 
 def _load_image(image: Numbers, camera: Camera) -> Float[Tensor, "h w 3"]:

@@ -15,7 +15,7 @@ from mover.bodies.corrected import has_mean_shape
 from mover.core.errors import InputError
 from mover.core.types import Bodies
 from mover.io.capture.pose_file import pose_of, pose_to_arrays, posed, reproduces
-from mover.io.files.fields import FASTEST, LAST_INDEX, SLOWEST, At, Warn
+from mover.io.files.fields import FASTEST, SLOWEST, At, Warn
 from mover.io.files.looks import check_faces
 from mover.io.files.npz import AMASS, is_amass, read_npy, read_npz, write_npz
 from mover.io.formats import names
@@ -50,8 +50,8 @@ def bodies_of(at: At, warn: Warn) -> Bodies:
     """The bodies of named arrays: meshes where they are given, else the posed model."""
     if is_amass(at):
         raise InputError(f"{at.file}: is {AMASS}; expected bodies.npz")
-    frame = indices(at.get("frame"), "B")
-    person = indices(at.get("person"), len(frame))
+    frame = torch.from_numpy(at.get("frame").indices("B"))
+    person = torch.from_numpy(at.get("person").indices(len(frame)))
     _check_rows(at, frame, person)
     pose = pose_of(at, len(frame))
     given = at.maybe("vertices")
@@ -63,7 +63,10 @@ def bodies_of(at: At, warn: Warn) -> Bodies:
     else:
         verts = _places(given, (len(frame), "V", 3))
         faces = _faces(at.get("faces"), verts.shape[1])
-        joints, names = _joints(at, len(frame))
+        joints, names = None, ()
+        if at.maybe("joints", "joint_names") is not None:  # both or neither
+            joints = _places(at.get("joints"), (len(frame), "J", 3))
+            names = tuple(map(str, at.get("joint_names").array((joints.shape[1],), "text")))
     space = at.get("space")
     word: Any = At(str(space.array((), "text")), at.file, space.field).choice(("camera", "world"))
     spread = scalar(at, "size_spread", 0.0, 1.0)
@@ -103,15 +106,6 @@ def odd_bodies(bodies: Bodies) -> list[str]:
     return found
 
 
-def indices(at: At, count: int | str) -> Int[Tensor, " rows"]:
-    """Frames or tracks."""
-    value = at.array((count,), "whole")
-    bad = (value < 0) | (value > LAST_INDEX)
-    if bad.any():
-        at.refuse(f"whole numbers from 0 to {LAST_INDEX}", f"{value[bad][0]}")
-    return torch.from_numpy(value.astype(np.int64))
-
-
 def _check_rows(at: At, frame: Int[Tensor, " rows"], person: Int[Tensor, " rows"]) -> None:
     """Refuse an empty file and a person who is twice in a frame."""
     if not len(frame):
@@ -139,16 +133,6 @@ def _faces(at: At, n_verts: int) -> Int[Tensor, "faces 3"]:
     return torch.from_numpy(value)
 
 
-def _joints(at: At, rows: int) -> tuple[Float[Tensor, "bodies joints 3"] | None, tuple[str, ...]]:
-    """Joints and their names, both or neither."""
-    given, names = at.maybe("joints"), at.maybe("joint_names")
-    if given is None and names is None:
-        return None, ()
-    joints = _places(at.get("joints"), (rows, "J", 3))
-    words = at.get("joint_names").array((joints.shape[1],), "text")
-    return joints, tuple(str(word) for word in words)
-
-
 def scalar(at: At, name: str, least: float, most: float) -> float | None:
     """A number that may be missing."""
     given = at.maybe(name)
@@ -165,12 +149,10 @@ def write_bodies(bodies: Bodies, path: Path) -> None:
 def bodies_to_arrays(bodies: Bodies) -> dict[str, NDArray[Any]]:
     """The arrays of bodies.npz."""
     arrays: dict[str, NDArray[Any]] = {
-        "frame": bodies.frame.cpu().numpy(),
-        "person": bodies.person.cpu().numpy(),
-        "space": np.array(bodies.space),
-        "vertices": bodies.verts.detach().cpu().numpy(),
+        "frame": bodies.frame.cpu().numpy(), "person": bodies.person.cpu().numpy(),
+        "space": np.array(bodies.space), "vertices": bodies.verts.detach().cpu().numpy(),
         "faces": bodies.faces.cpu().numpy(),
-    }
+    }  # fmt: skip
     for name in ("fps", "size_spread"):
         if getattr(bodies, name) is not None:
             arrays[name] = np.array(getattr(bodies, name))

@@ -157,9 +157,6 @@ def _unexplained(thin: Capture, found: Agreement) -> Iterator[str]:
         yield f"{missed(mean(found.people))}; are bodies, masks and camera of one video?"
 
 
-# The table.
-
-
 WORLDS = {
     "on the side (+z is up)": ("x z -y", 1, "+y must be up (import: --up z)"),
     "upside down (+y is down)": ("x -y -z", -1, "+y must be up (import: --up=-y)"),

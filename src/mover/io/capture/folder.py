@@ -12,12 +12,7 @@ from mover.core.errors import InputError
 from mover.core.files import copy_whole
 from mover.core.types import Camera, Capture, DepthImage
 from mover.geometry.path import is_still
-from mover.io.capture.annotations_file import (
-    detections_to_json,
-    furniture_to_json,
-    image_name,
-    people_to_json,
-)
+from mover.io.capture.annotations_file import detections_to_json, image_name, people_to_json
 from mover.io.capture.bodies_file import write_bodies
 from mover.io.capture.build import build_capture
 from mover.io.capture.camera_file import camera_to_json, path_to_arrays
@@ -147,7 +142,9 @@ def write_capture(capture: Capture, folder: Path) -> None:
     if depth is not None:
         images.write_depth_image(depth, folder)
     if capture.furniture is not None:
-        write_json(furniture_to_json(capture.furniture), folder / FURNITURE)
+        tree = people_to_json(capture.furniture, None, None, ())
+        tree["categories"] = [{"id": 1, "name": "object"}]
+        write_json(tree, folder / FURNITURE)
     write_trees(capture, folder, None if capture.reference is None else "reference.png")
     others = {h.id for h in capture.hypotheses}
     groups = {one.id: [one, *(h for h in capture.hypotheses if h.id == one.id)]

@@ -29,9 +29,6 @@ def axes(rows: str) -> Matrix:
                          for word in rows.split()])  # fmt: skip
 
 
-# The scene
-
-
 def each(change: Change, capture: Capture) -> Capture:
     """All objects changed, and their other hypotheses."""
     scene = capture.scene
@@ -80,9 +77,6 @@ def in_radians(one: SceneObject) -> SceneObject:
     return replace(one, yaw=one.yaw.deg2rad(), segments=parts)
 
 
-# The camera
-
-
 def seen_by(camera: Camera, capture: Capture) -> Capture:
     """Another camera in the same world."""
     return replace(capture, scene=replace(capture.scene, camera=camera))
@@ -100,9 +94,6 @@ def head_up(capture: Capture) -> Capture:
     new = tilt(-1, math.pi, capture)
     A = new.scene.camera.R_cam_world.mT @ capture.scene.camera.R_cam_world
     return each(partial(placed, A, -1), new)
-
-
-# People and masks
 
 
 def people(A: Matrix, capture: Capture) -> Capture:

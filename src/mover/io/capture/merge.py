@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import logging
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,14 +15,21 @@ import torch
 from mover.core.errors import InputError
 from mover.core.records import fingerprint, rows_of
 from mover.core.types import Bodies, Camera, Capture, Scene
-from mover.io.capture.agreement import bounded
+from mover.furniture.library import canonical
+from mover.io.capture.agreement import (
+    assigned,
+    bounded,
+    in_image,
+    outermost,
+    outlines,
+    pairwise_iou2d,
+)
 from mover.io.capture.annotations_file import detections_of, people_of
 from mover.io.capture.bodies_file import bodies_of, bodies_to_arrays, write_bodies
 from mover.io.capture.build import build_capture
 from mover.io.capture.camera_file import camera_of, turned
 from mover.io.capture.edits import carried, facing
 from mover.io.capture.folder import REFERENCE, folder_parts, read_capture, write_trees
-from mover.io.capture.pairing import linked, named_rows, pair_rows
 from mover.io.capture.parts import UNKNOWN, Parts
 from mover.io.capture.pose_file import joined_bodies
 from mover.io.capture.tracks import numbers_beside, renumbered
@@ -35,6 +42,10 @@ log = logging.getLogger(__name__)
 
 MOST = 0.5  # share of masks that must be of things, not of what is around them
 SMALL_TURN = 1e-5  # a new rotation of the camera that is the old one
+LEAST = 0.1  # boxes of one class that share less are not of one thing
+OTHER_CLASS = 0.5  # the same, of different classes
+Rows = Sequence[Mapping[str, Any]]
+"""Annotations of objects.json with the names of their categories as `category_id`."""
 
 
 @dataclass(frozen=True)
@@ -110,11 +121,7 @@ def with_parts(old: Parts, new: Parts) -> Parts:
 
 
 def _bodies(old: At | None, new: At | None) -> tuple[At | None, tuple[str, ...]]:
-    """The bodies of both files, and what is said: people of the newer count where both have them.
-
-    Raises:
-        InputError: If they cannot be in one file.
-    """
+    """The bodies of both files, those of the newer where both have a person, and what is said."""
     if old is None or new is None or new is old:
         return new or old, ()
     first, second = (bodies_of(at, lambda _: None) for at in (old, new))
@@ -189,6 +196,51 @@ def _objects(old: Parts, new: Parts) -> At | None:
     others = [row for j, row in enumerate(theirs) if j not in set(pairs.values())]
     rows += [{**row, "id": free + k} for k, row in enumerate(others)]
     return At(annotations_tree(rows, first.get("images").items()[0].value), first.file)
+
+
+def named_rows(at: At) -> list[dict[str, Any]]:
+    """The annotations of objects.json with the names of their categories instead of ids."""
+    names = {c.value["id"]: str(c.value["name"]) for c in at.get("categories").items()}
+    return [
+        {**item.value, "category_id": names[item.value["category_id"]]}
+        for item in at.get("annotations").items()
+    ]
+
+
+def pair_rows(ours: Rows, theirs: Rows) -> dict[int, int]:
+    """Rows (`category_id`, `bbox`) that show one thing: those with the greatest sum of overlaps.
+
+    Returns:
+        Index in `theirs` by index in `ours`.
+    """
+    if not ours or not theirs:
+        return {}
+    boxes = [np.array([row["bbox"] for row in side], dtype=np.float64) for side in (ours, theirs)]
+    a, b = (torch.from_numpy(box + np.pad(box[:, :2], ((0, 0), (2, 0)))) for box in boxes)
+    shared = pairwise_iou2d(a, b).numpy()
+    names, others = ([row["category_id"] for row in side] for side in (ours, theirs))
+    same = np.array([[UNKNOWN in (x, y) or canonical(x) == canonical(y) for y in others]
+                     for x in names])  # fmt: skip
+    gain = np.where(shared >= np.where(same, LEAST, OTHER_CLASS), shared + same, 0.0)
+    return dict(assigned(torch.from_numpy(gain), LEAST))
+
+
+def linked(scene: Scene, at: At) -> dict[str, int]:
+    """Annotation of each object that has none yet, by the objects' outlines in the image.
+
+    Returns:
+        Annotation id by object id, for those that find one.
+    """
+    used = {p.annotation for p in scene.objects}
+    free = [row for row in named_rows(at) if row["id"] not in used]
+    bare: list[dict[str, Any]] = []
+    pieces = [outermost(piece) for piece in scene.objects if piece.annotation is None]
+    boxes = in_image(outlines(pieces, scene.camera), scene.camera).tolist()
+    for piece, (x, y, right, bottom) in zip(pieces, boxes, strict=True):
+        if x < right and y < bottom:
+            size = [x, y, right - x, bottom - y]
+            bare.append({"id": piece.id, "category_id": piece.category, "bbox": size})
+    return {bare[i]["id"]: free[j]["id"] for i, j in pair_rows(bare, free).items()}
 
 
 def _capture(whole: Parts) -> Capture | None:

@@ -31,15 +31,10 @@ LOWEST = 30.0  # [m], of a floor below the camera
 P = TypeVar("P", SceneObject, Segment)
 
 
-def read_scene(path: Path, camera: Camera | None = None, warn: Warn = log.warning) -> Scene:
-    """Read and check a scene and its meshes.
-
-    Args:
-        path: Of scene.json; meshes are relative to its folder.
-        camera: Used where the file has none.
-        warn: Takes what is odd but not wrong.
-    """
-    return scene_of(read_json(path), partial(read_mesh, folder=path.parent), camera, warn)[0]
+def read_scene(path: Path, camera: Camera | None = None) -> Scene:
+    """Read and check a scene and its meshes; `camera` is used where the file has none."""
+    load = partial(read_mesh, folder=path.parent)
+    return scene_of(read_json(path), load, camera, log.warning)[0]
 
 
 class PlaceFields(Struct, frozen=True):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mover.core.errors import InputError
 from mover.core.types import ContactLabels
-from mover.io.export.finished import Exported, Finished, Up, clock_of, tracks_of
+from mover.io.export.finished import Exported, Finished, Up, tracks_of
 from mover.io.export.solids import AXES, floor_height
 from mover.io.files.npz import read_npz, write_npz
 
@@ -83,7 +83,7 @@ def export_contacts(finished: Finished, folder: Path, up: Up = "y") -> Exported:
         for name, table in spots.items():
             table[cells] = getattr(labels, name)[kept].float()
         arrays = {
-            "frame": track.frame.numpy(), "fps": np.array(clock_of(bodies)[1]),
+            "frame": track.frame.numpy(), "fps": np.array(finished.clock[1]),
             "parts": np.array(labels.parts), "objects": np.array(labels.objects),
             "contact": contact.numpy(), "object_contact": (contact.amax(1) >= SURE).numpy(),
             "up_axis": np.array(up), **{name: table.numpy() for name, table in spots.items()},

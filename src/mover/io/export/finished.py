@@ -35,6 +35,11 @@ class Finished:
     given: Bodies | None
     """People as the capture had them, with the parameters of their model."""
 
+    @property
+    def clock(self) -> tuple[int, float]:
+        """`clock_of` the people."""
+        return clock_of(self.bodies)
+
 
 @dataclass(frozen=True)
 class Exported:
@@ -69,6 +74,13 @@ class Track:
     last: float
     """Time of the last frame of the file [s]."""
 
+    def spans(self) -> list[tuple[float, float]]:
+        """Spans of time in which the person is visible [s]."""
+        breaks = (self.time.diff() > GAP).nonzero()[:, 0].tolist()
+        starts, ends = [0, *(b + 1 for b in breaks)], [*breaks, len(self.time) - 1]
+        pairs = zip(starts, ends, strict=True)
+        return [(float(self.time[a]), float(self.time[b])) for a, b in pairs]
+
 
 def clock_of(bodies: Bodies | None) -> tuple[int, float]:
     """The first frame of the file, which is at 0 s, and the frames a second."""
@@ -88,13 +100,6 @@ def tracks_of(bodies: Bodies) -> list[Track]:
         frame = bodies.frame[rows]
         found.append(Track(person, rows, frame, (frame - first).double() / fps, last))
     return found
-
-
-def visible_spans(track: Track) -> list[tuple[float, float]]:
-    """Spans of time in which the person is visible [s]."""
-    breaks = (track.time.diff() > GAP).nonzero()[:, 0].tolist()
-    starts, ends = [0, *(b + 1 for b in breaks)], [*breaks, len(track.time) - 1]
-    return [(float(track.time[a]), float(track.time[b])) for a, b in zip(starts, ends, strict=True)]
 
 
 def keyframes(

@@ -13,16 +13,7 @@ from torch import Tensor
 from mover.core.colours import person_colour
 from mover.core.types import Bodies, SceneObject
 from mover.geometry.mesh import vertex_normals
-from mover.io.export.finished import (
-    BodyForm,
-    Exported,
-    Finished,
-    Track,
-    clock_of,
-    keyframes,
-    tracks_of,
-    visible_spans,
-)
+from mover.io.export.finished import BodyForm, Exported, Finished, Track, keyframes, tracks_of
 from mover.io.export.posed import Skinned, all_angles, bones_for, rest_of
 from mover.io.export.scene_glb import linear, losses_of, placement_of, write_glb
 
@@ -47,7 +38,7 @@ def export_glb(finished: Finished, folder: Path, body: BodyForm = "auto") -> Exp
     scene, bodies = finished.scene, None if body == "none" else finished.bodies
     moved = [item for item in scene.objects if item.segments]
     skin = bones_for(finished, body, INFLUENCES)
-    first, fps = clock_of(finished.bodies)
+    first, fps = finished.clock
     notes = losses_of(scene)
     if bodies is not None or moved:
         notes.append(f"frame {first} of the video is at 0 s, each next one {1 / fps:g} s later")
@@ -110,11 +101,9 @@ class Gltf:
         raw, key = np.ascontiguousarray(array).tobytes(), f"moving_{len(self.blocks)}"
         self.blocks[key] = raw + bytes(-len(raw) % 4)
         accessor: dict[str, Any] = {
-            "bufferView": len(self.blocks) - 1,
-            "componentType": KINDS[str(array.dtype)],
-            "count": len(array),
-            "type": SHAPES[array.shape[1:]],
-        }
+            "bufferView": len(self.blocks) - 1, "componentType": KINDS[str(array.dtype)],
+            "count": len(array), "type": SHAPES[array.shape[1:]],
+        }  # fmt: skip
         if array.ndim < 3:
             flat = array.reshape(len(array), -1)
             accessor |= {"min": flat.min(0).tolist(), "max": flat.max(0).tolist()}
@@ -156,7 +145,7 @@ def _add_presence(file: Gltf, node: int, track: Track) -> None:
     """Hide a person who is not visible: a node of size zero is not drawn (glTF, Sec. 3.6)."""
     events: dict[float, float] = {0.0: 0.0}
     step = float(track.time.diff().min()) if len(track.time) > 1 else 0.2
-    for start, end in visible_spans(track):
+    for start, end in track.spans():
         events[start] = 1.0
         if end < track.last - 1e-6:
             events[end + step] = 0.0
@@ -228,11 +217,9 @@ def _add_skinned(file: Gltf, skin: Skinned, track: Track) -> None:
     top = file.add_root({"name": name, "children": [first]})
     share, joint = model.weights.topk(INFLUENCES, dim=1)
     arrays = {
-        "POSITION": rest,
-        "NORMAL": vertex_normals(rest, model.faces),
-        "JOINTS_0": torch.where(share > 0, joint, 0).to(torch.uint8),
-        "WEIGHTS_0": share,
-    }
+        "POSITION": rest, "NORMAL": vertex_normals(rest, model.faces),
+        "JOINTS_0": torch.where(share > 0, joint, 0).to(torch.uint8), "WEIGHTS_0": share,
+    }  # fmt: skip
     mesh = file.add_mesh(name, track.person, arrays, model.faces)
     inverse = torch.eye(4).repeat(len(joints), 1, 1)  # from the rest shape to each joint's axes
     inverse[:, :3, :3] = model.tpose

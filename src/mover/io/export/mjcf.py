@@ -14,7 +14,7 @@ from mover.core.colours import colour
 from mover.core.files import replacing
 from mover.core.run import Run
 from mover.core.types import Mesh, Scene
-from mover.io.export.finished import Exported, Finished, clock_of
+from mover.io.export.finished import Exported, Finished
 from mover.io.export.solids import AXES, FRICTION, Solid, floor_height, moved_to, solids_of
 
 STEP = 0.002  # [s]
@@ -127,7 +127,7 @@ def _add_solid(world: Element, solid: Solid) -> Element:
 def _add_stays(root: Element, finished: Finished, solids: Sequence[Solid]) -> None:
     """A keyframe for each change, with the furniture where it then stands."""
     keys, objects = SubElement(root, "keyframe"), finished.scene.objects
-    first, fps = clock_of(finished.bodies)
+    first, fps = finished.clock
     for frame in sorted({s.frame for item in objects for s in item.segments}):
         pairs = zip(objects, solids, strict=True)
         stands = [moved_to(solid, item, frame) for item, solid in pairs if solid.free]

@@ -152,11 +152,9 @@ def _material(rgba: tuple[float, float, float, float], name: str) -> Any:  # noq
     return PBRMaterial(
         name=name,
         baseColorFactor=[*(round(255 * c) for c in linear(rgba[:3])), round(255 * rgba[3])],
-        metallicFactor=0.0,
-        roughnessFactor=0.9,
-        alphaMode="BLEND" if rgba[3] < 1 else "OPAQUE",
+        metallicFactor=0.0, roughnessFactor=0.9, alphaMode="BLEND" if rgba[3] < 1 else "OPAQUE",
         doubleSided=True,
-    )
+    )  # fmt: skip
 
 
 def _solid(mesh: Mesh, rgba: tuple[float, float, float, float], name: str) -> Any:  # noqa: ANN401
@@ -164,11 +162,9 @@ def _solid(mesh: Mesh, rgba: tuple[float, float, float, float], name: str) -> An
     from trimesh.visual import TextureVisuals
 
     return trimesh.Trimesh(
-        mesh.verts.detach().cpu().double().numpy(),
-        mesh.faces.cpu().numpy(),
-        process=False,
+        mesh.verts.detach().cpu().double().numpy(), mesh.faces.cpu().numpy(), process=False,
         visual=TextureVisuals(material=_material(rgba, name)),
-    )
+    )  # fmt: skip
 
 
 def floor_of(scene: Scene, height: float) -> Mesh:

@@ -19,17 +19,7 @@ from mover.core.run import Run
 from mover.core.types import Bodies, Camera, SceneObject
 from mover.geometry.camera import NEAR
 from mover.io.export import scene_glb
-from mover.io.export.finished import (
-    BodyForm,
-    Exported,
-    Finished,
-    Track,
-    Up,
-    clock_of,
-    keyframes,
-    tracks_of,
-    visible_spans,
-)
+from mover.io.export.finished import BodyForm, Exported, Finished, Track, Up, keyframes, tracks_of
 from mover.io.export.solids import AXES, FRICTION, Solid, floor_height, solids_of
 
 GRAVITY = 9.81  # [m/s²]
@@ -76,7 +66,7 @@ def export_usd(finished: Finished, folder: Path, body: BodyForm = "auto", up: Up
         _add_scene(stage, finished, folder)
         for track in [] if bodies is None else tracks_of(bodies):
             assert bodies is not None
-            _add_person(stage, bodies, track)
+            _add_person(stage, bodies, track, finished.clock)
         stage.GetRootLayer().Save()
     moving = "people's meshes move in straight lines between samples, 2 mm off"
     notes = ("no people" if bodies is None else moving, *scene_glb.losses_of(finished.scene))
@@ -98,7 +88,7 @@ def _head(stage: Stage, finished: Finished, up: Up) -> None:
         room.AddRotateXOp(double).Set(90.0)
     bodies = finished.bodies
     if bodies is not None:
-        first, fps = clock_of(bodies)
+        first, fps = finished.clock
         stage.SetTimeCodesPerSecond(fps)
         stage.SetFramesPerSecond(fps)
         stage.SetStartTimeCode(first)
@@ -168,7 +158,7 @@ def _add_camera(stage: Stage, camera: Camera) -> None:
     view.Set(Gf.Matrix4d(scene_glb.view_matrix(camera).T.tolist()))
 
 
-def _add_person(stage: Stage, bodies: Bodies, track: Track) -> None:
+def _add_person(stage: Stage, bodies: Bodies, track: Track, clock: tuple[int, float]) -> None:
     """A mesh with samples of time, straight lines between them, hidden where not visible."""
     UsdGeom, TimeCode = pxr("UsdGeom"), pxr("Usd").TimeCode
     verts = bodies.verts[track.rows].detach().cpu().float()
@@ -177,8 +167,8 @@ def _add_person(stage: Stage, bodies: Bodies, track: Track) -> None:
     mesh = add_mesh(stage, path, verts[0].numpy(), bodies.faces.cpu().numpy(), tint)
     for key in keyframes(verts, track.time, TOLERANCE, MOST)[0]:
         set_points(mesh, verts[key].numpy(), TimeCode(float(track.frame[key])))
-    visible, (first, fps) = mesh.CreateVisibilityAttr(), clock_of(bodies)
-    for start, end in visible_spans(track):
+    visible, (first, fps) = mesh.CreateVisibilityAttr(), clock
+    for start, end in track.spans():
         if start > 0:
             visible.Set(UsdGeom.Tokens.invisible, float(first))
         visible.Set(UsdGeom.Tokens.inherited, first + round(start * fps))

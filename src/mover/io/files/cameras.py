@@ -127,13 +127,9 @@ def _numbers(at: At) -> NDArray[np.float64]:
 
 
 def _of_matrix(K: NDArray[np.float64], size: Size, at: At, shift: float = HALF) -> At:
-    """A camera from its matrix, and the size, the distortion and the pose beside it.
+    """A camera from its matrix, and the size, the distortion and the pose beside it in `at`.
 
-    Args:
-        K: Intrinsics, whose principal point lacks a `shift` [px].
-        size: Width and height of the image, before those that the file gives [px].
-        at: The mapping in which the matrix stands.
-        shift: Of the centre of the first pixel [px].
+    The principal point of the matrix lacks a `shift` [px]; the size goes before that of the file.
     """
     sides = [at.maybe(*names) for names in SIDES]
     if size is None and None not in sides:

@@ -90,13 +90,13 @@ class At:
             self.refuse("one of " + ", ".join(choices))
         return self.value
 
-    def number(self, low: float = -LARGEST, high: float = LARGEST) -> float:
-        """A finite number between the bounds."""
+    def number(self, low: float = -LARGEST, high: float = LARGEST, expected: str = "") -> float:
+        """A finite number between the bounds, which messages call as `expected`."""
         bounds = "" if (low, high) == (-LARGEST, LARGEST) else f" from {low:g} to {high:g}"
         value = self.value
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
         if not is_number or not low <= value <= high:  # false for NaN as well
-            self.refuse(f"a finite number{bounds}")
+            self.refuse(expected or f"a finite number{bounds}")
         return float(value)
 
     def integer(self, low: int = 0, high: int = LAST_INDEX) -> int:
@@ -105,6 +105,14 @@ class At:
         if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
             self.refuse(f"a whole number from {low} to {high}")
         return value
+
+    def indices(self, count: int | str) -> NDArray[np.int64]:
+        """An array of so many frames or tracks."""
+        value = self.array((count,), "whole")
+        bad = (value < 0) | (value > LAST_INDEX)
+        if bad.any():
+            self.refuse(f"whole numbers from 0 to {LAST_INDEX}", f"{value[bad][0]}")
+        return value.astype(np.int64)
 
     def vector(self, count: int) -> list[float]:
         """A list of `count` finite numbers."""

@@ -108,10 +108,7 @@ def _within(at: At, base: Any, meta: Any) -> Any:  # noqa: ANN401
     if base is int:
         return at.integer(meta.ge, meta.le)
     if base is float:
-        is_number = isinstance(at.value, int | float) and not isinstance(at.value, bool)
-        if not is_number or not meta.ge <= at.value <= meta.le:
-            at.refuse(meta.description or f"a finite number from {meta.ge:g} to {meta.le:g}")
-        return float(at.value)
+        return at.number(meta.ge, meta.le, meta.description or "")
     if len(at.items()) > meta.max_length:
         at.refuse(meta.description, f"{len(at.value)} items")
     return checked(at, base)

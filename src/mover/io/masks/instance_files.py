@@ -13,33 +13,9 @@ from mover.io.capture.parts import UNKNOWN, Hints, Parts
 from mover.io.files.fields import LAST_INDEX, At, read_json
 from mover.io.files.images import image_size
 from mover.io.files.schema import Id, Index, Share, Side, Text, checked
-from mover.io.masks.coco import (
-    COCO_CLASSES,
-    COCO_IDS,
-    MOST_THINGS,
-    CategoryFields,
-    is_drawn,
-)  # fmt: skip
-from mover.io.masks.instances import (
-    Instance,
-    Instances,
-    Size,
-    code_in,
-    fitted,
-    followed,
-    frames_of,
-    is_person,
-    mask_code,
-    objects_tree,
-    people_in,
-)
-from mover.io.masks.label_images import (
-    PICTURES,
-    Names,
-    pictures_in,
-    read_label_images,
-    read_mask_arrays,
-)
+from mover.io.masks.coco import COCO_CLASSES, COCO_IDS, MOST_THINGS, CategoryFields, is_drawn
+from mover.io.masks.instances import Instance, Instances, Names, Size, code_in, frames_of, mask_code
+from mover.io.masks.label_images import PICTURES, pictures_in, read_label_images, read_mask_arrays
 from mover.io.people.values import PICKLES, natural, number_in
 
 LEAST_SCORE = 0.3  # of MMDetection, which writes everything that it thought of
@@ -69,7 +45,7 @@ def mask_parts(source: Path, hints: Hints) -> Parts:
         size = camera["w"], camera["h"]
     picture = "" if hints.image is None else hints.image.name
     found = read_things(source, hints.names, size, picture)
-    tree = objects_tree(found, found.items)
+    tree = found.objects_tree()
     return Parts(name=source.stem, objects=tree, notes=found.notes)
 
 
@@ -101,10 +77,10 @@ def read_things(
         found = dataclasses.replace(found, items=kept, notes=(*found.notes, said))
     else:  # which frame it is does not matter
         found = dataclasses.replace(found, notes=tuple(n for n in found.notes if "frame" not in n))
-    found = fitted(found, fit or size)
+    found = found.fitted(fit or size)
     if people:
-        return people_in(found)
-    kept = tuple(item for item in found.items if not is_person(item))
+        return found.people()
+    kept = tuple(item for item in found.items if not item.is_person)
     notes = found.notes
     if bare := sum(item.category == UNKNOWN for item in kept):
         notes += (f"{path.name}: {bare} of {len(kept)} masks have no category: --names 1=chair",)
@@ -115,8 +91,8 @@ def read_things(
 
 def read_people(path: Path, names: Names, size: Size | None, fit: Size | None = None) -> Instances:
     """The people in the frames of a video, each in a track, in images of the size `fit`."""
-    found = fitted(read_instances(path, names, size, people=True), fit or size)
-    return followed(people_in(found))
+    found = read_instances(path, names, size, people=True)
+    return found.fitted(fit or size).people().followed()
 
 
 def read_instances(
@@ -387,12 +363,10 @@ def _instance(
     key = -1 if row.category_id is None else row.category_id
     return Instance(
         category=words.get(key, UNKNOWN) if row.name is None else str(row.name),
-        box=None if box is None else tuple(box),
-        mask=code_in(_drawn(at, row), size),
+        box=None if box is None else tuple(box), mask=code_in(_drawn(at, row), size),
         score=1.0 if score is None else score,
-        frame=0 if row.image_id is None else frames[row.image_id],
-        track=row.track_id,
-    )
+        frame=0 if row.image_id is None else frames[row.image_id], track=row.track_id,
+    )  # fmt: skip
 
 
 def _drawn(at: At, row: RowFields) -> At | None:

@@ -1,7 +1,7 @@
 """Instances in images: masks and boxes, on the way to objects.json and people.json."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,8 @@ PERSON = frozenset({
 SAME_SHAPE = 0.02  # masks of another size fit an image whose sides have this ratio, nearly
 Size = tuple[int, int]
 """Width and height of an image [px]."""
+Names = Mapping[str, str]
+"""Categories where the source has none: by number, file name or index."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,11 @@ class Instance:
     frame: int = 0
     track: int | None = None
 
+    @property
+    def is_person(self) -> bool:
+        """Whether it is a person."""
+        return self.category.lower() in PERSON or plain_name(self.category) in PERSON
+
 
 @dataclass(frozen=True)
 class Instances:
@@ -54,6 +61,116 @@ class Instances:
     """Those that were looked at, with things in them or without."""
     notes: tuple[str, ...] = ()
     """What was decided that the source does not say."""
+
+    def fitted(self, size: Size | None) -> "Instances":
+        """The instances in an image of this size, resampled where theirs has the same shape."""
+        if size is None or self.size is None or self.size == size:
+            return self if self.size is not None else dataclasses.replace(self, size=size)
+        (w, h), (width, height) = self.size, size
+        if abs(w * height / (h * width) - 1) > SAME_SHAPE:
+            at = f"{self.file}: masks of {w} x {h} pixels"
+            raise InputError(f"{at}, expected those of an image of {width} x {height}")
+        rows = ((np.arange(height) + 0.5) * h / height).astype(np.int64).clip(0, h - 1)
+        columns = ((np.arange(width) + 0.5) * w / width).astype(np.int64).clip(0, w - 1)
+        items: list[Instance] = []
+        for item in self.items:
+            box, mask = item.box, item.mask
+            if box is not None:
+                box = tuple(v * (width / w, height / h)[i % 2] for i, v in enumerate(box))
+            if mask is not None:
+                mask = code_of(decode(Masks(h, w, (mask,)), 0).numpy()[rows][:, columns])
+            items.append(dataclasses.replace(item, box=box, mask=mask))
+        said = f"masks of {w} x {h} pixels are stretched to the image of {width} x {height}"
+        return dataclasses.replace(self, items=tuple(items), size=size, notes=(*self.notes, said))
+
+    def people(self) -> "Instances":
+        """The people among the instances, and such as have no name.
+
+        Where no name is a person's or a thing's that is known, all are people.
+        """
+        kept = [item for item in self.items if item.is_person or item.category == UNKNOWN]
+        others = sorted({item.category for item in self.items} - {UNKNOWN})
+        notes = list(self.notes)
+        if not kept and others:
+            kept = [item for item in self.items if unknown_names([item.category])]
+            named = listed("name", [repr(name) for name in others])
+            if not kept:
+                wanted = "expected masks of people"
+                raise InputError(f"{self.file}: has no people, only {named}, {wanted}")
+            notes.append(f"{named} taken as people's")
+        return dataclasses.replace(self, items=tuple(kept), notes=tuple(notes))
+
+    def objects_tree(self) -> At:
+        """The fields of objects.json; ids are the ranks of the instances.
+
+        Raises:
+            InputError: If the size of the image is not known.
+        """
+        width, height = _size_of(self, "image")
+        names = list(dict.fromkeys(item.category for item in self.items))
+        rows: list[dict[str, Any]] = []
+        for i, item in enumerate(self.items):
+            row: dict[str, Any] = {"id": i, "category_id": item.category}
+            if item.mask is not None:
+                row["segmentation"] = segmentation(Masks(height, width, (item.mask,)), 0)
+            x, y, right, bottom = _box_of(item, self.size)
+            if x < right and y < bottom:  # else there is nothing of it in the image
+                rows.append({**row, "bbox": [x, y, right - x, bottom - y], "score": item.score})
+        image = {"width": width, "height": height}
+        return At(annotations_tree(rows, image, names), self.file)
+
+    def people_tree(self, fps: float | None = None) -> At:
+        """The fields of people.json: everything is a person.
+
+        Raises:
+            InputError: If the size of the images is not known.
+        """
+        width, height = _size_of(self, "images")
+        rows = [
+            {"image_id": item.frame, "track_id": item.track, "category_id": 1,
+             "segmentation": segmentation(Masks(height, width, (item.mask,)), 0)}
+            for item in self.followed().items if item.mask is not None
+        ]  # fmt: skip
+        frames = sorted(self.frames | {item.frame for item in self.items})
+        tree = {
+            "info": {} if fps is None else {"fps": fps},
+            "images": [{"id": f, "width": width, "height": height} for f in frames],
+            "categories": [{"id": 1, "name": "person"}],
+            "annotations": [{"id": i, **row} for i, row in enumerate(rows)],
+        }
+        return At(tree, self.file)
+
+    def followed(self) -> "Instances":
+        """The instances by frame, with a track each, by their places where they have none.
+
+        Of one track and frame that with the best score counts. Tracks that are made are numbered
+        from the left in the frame in which they start.
+        """
+        free = [item for item in self.items if item.track is None]
+        best: dict[tuple[int, int], Instance] = {}
+        for item in sorted(self.items, key=lambda i: -i.score):
+            if item.track is not None:
+                best.setdefault((item.frame, item.track), item)
+        notes = self.notes
+        if free:
+            boxes = np.array([_box_of(item, self.size) for item in free]).reshape(-1, 4)
+            left = (boxes[:, 0] + boxes[:, 2]).tolist()
+            order = sorted(range(len(free)), key=lambda k: (free[k].frame, left[k]))
+            boxes, free = boxes[order] / 2, [free[k] for k in order]
+            sizes = np.linalg.norm(boxes[:, 2:] - boxes[:, :2], axis=1)
+            frames = [item.frame for item in free]
+            lone = len(set(frames)) == len(frames)  # never two at a time: it is one person
+            tracks = [0] * len(free) if lone else bodies.followed(frames, boxes, sizes).tolist()
+            used = {track for _, track in best}
+            numbers = [n for n in range(len(used) + max(tracks) + 1) if n not in used]
+            for item, track in zip(free, tracks, strict=True):
+                key = item.frame, numbers[track]
+                best[key] = dataclasses.replace(item, track=numbers[track])
+            if len(free) > len(set(tracks)):
+                how = "one in each frame, taken as the same" if lone else "followed by their places"
+                notes = (*notes, f"{self.file}: people without tracks: {max(tracks) + 1}, {how}")
+        items = tuple(best[key] for key in sorted(best))
+        return dataclasses.replace(self, items=items, notes=notes)
 
 
 def mask_code(at: At) -> dict[str, Any]:
@@ -103,131 +220,11 @@ def frames_of(numbers: Sequence[int], what: str) -> tuple[dict[int, int], tuple[
     return {n: n - first for n in known}, (f"{said} {how}",) if len(known) > 1 else ()
 
 
-def fitted(found: Instances, size: Size | None) -> Instances:
-    """The instances in an image of this size, resampled where theirs has the same shape."""
-    if size is None or found.size is None or found.size == size:
-        return found if found.size is not None else dataclasses.replace(found, size=size)
-    (w, h), (width, height) = found.size, size
-    if abs(w * height / (h * width) - 1) > SAME_SHAPE:
-        at = f"{found.file}: masks of {w} x {h} pixels"
-        raise InputError(f"{at}, expected those of an image of {width} x {height}")
-    rows = ((np.arange(height) + 0.5) * h / height).astype(np.int64).clip(0, h - 1)
-    columns = ((np.arange(width) + 0.5) * w / width).astype(np.int64).clip(0, w - 1)
-    items: list[Instance] = []
-    for item in found.items:
-        box, mask = item.box, item.mask
-        if box is not None:
-            box = tuple(v * (width / w, height / h)[i % 2] for i, v in enumerate(box))
-        if mask is not None:
-            mask = code_of(decode(Masks(h, w, (mask,)), 0).numpy()[rows][:, columns])
-        items.append(dataclasses.replace(item, box=box, mask=mask))
-    said = f"masks of {w} x {h} pixels are stretched to the image of {width} x {height}"
-    return dataclasses.replace(found, items=tuple(items), size=size, notes=(*found.notes, said))
-
-
-def is_person(item: Instance) -> bool:
-    """Whether an instance is a person."""
-    return item.category.lower() in PERSON or plain_name(item.category) in PERSON
-
-
-def people_in(found: Instances) -> Instances:
-    """The people among the instances, and such as have no name.
-
-    Where no name is a person's or a thing's that is known, all are people.
-    """
-    kept = [item for item in found.items if is_person(item) or item.category == UNKNOWN]
-    others = sorted({item.category for item in found.items} - {UNKNOWN})
-    notes = list(found.notes)
-    if not kept and others:
-        kept = [item for item in found.items if unknown_names([item.category])]
-        named = listed("name", [repr(name) for name in others])
-        if not kept:
-            raise InputError(f"{found.file}: has no people, only {named}, expected masks of people")
-        notes.append(f"{named} taken as people's")
-    return dataclasses.replace(found, items=tuple(kept), notes=tuple(notes))
-
-
-def objects_tree(found: Instances, items: Sequence[Instance]) -> At:
-    """The fields of objects.json; ids are the ranks in `items`.
-
-    Raises:
-        InputError: If the size of the image is not known.
-    """
-    width, height = _size_of(found, "image")
-    names = list(dict.fromkeys(item.category for item in items))
-    rows: list[dict[str, Any]] = []
-    for i, item in enumerate(items):
-        row: dict[str, Any] = {"id": i, "image_id": 0, "category_id": item.category}
-        if item.mask is not None:
-            row["segmentation"] = segmentation(Masks(height, width, (item.mask,)), 0)
-        x, y, right, bottom = _box_of(item, found.size)
-        if x < right and y < bottom:  # else there is nothing of it in the image
-            rows.append({**row, "bbox": [x, y, right - x, bottom - y], "score": item.score})
-    image = {"id": 0, "width": width, "height": height}
-    return At(annotations_tree(rows, image, names), found.file)
-
-
-def people_tree(found: Instances, fps: float | None = None) -> At:
-    """The fields of people.json: everything in `found` is a person.
-
-    Raises:
-        InputError: If the size of the images is not known.
-    """
-    width, height = _size_of(found, "images")
-    rows: list[dict[str, Any]] = []
-    for item in followed(found).items:
-        row = {"id": len(rows), "image_id": item.frame, "track_id": item.track, "category_id": 1}
-        if item.mask is not None:
-            mask = segmentation(Masks(height, width, (item.mask,)), 0)
-            rows.append({**row, "segmentation": mask})
-    frames = sorted(found.frames | {item.frame for item in found.items})
-    tree = {
-        "info": {} if fps is None else {"fps": fps},
-        "images": [{"id": f, "width": width, "height": height} for f in frames],
-        "categories": [{"id": 1, "name": "person"}],
-        "annotations": rows,
-    }
-    return At(tree, found.file)
-
-
 def _size_of(found: Instances, what: str) -> Size:
     """Width and height [px]."""
     if found.size is None:
         raise InputError(f"{found.file}: has no size of the {what}, expected --image beside it")
     return found.size
-
-
-def followed(found: Instances) -> Instances:
-    """The instances by frame, with a track each: those without one are followed by their places.
-
-    Of one track and frame that with the best score counts. Tracks that are made are numbered from
-    the left in the frame in which they start.
-    """
-    free = [item for item in found.items if item.track is None]
-    best: dict[tuple[int, int], Instance] = {}
-    for item in sorted(found.items, key=lambda i: -i.score):
-        if item.track is not None:
-            best.setdefault((item.frame, item.track), item)
-    notes = found.notes
-    if free:
-        boxes = np.array([_box_of(item, found.size) for item in free]).reshape(-1, 4)
-        left = (boxes[:, 0] + boxes[:, 2]).tolist()
-        order = sorted(range(len(free)), key=lambda k: (free[k].frame, left[k]))
-        boxes, free = boxes[order] / 2, [free[k] for k in order]
-        sizes = np.linalg.norm(boxes[:, 2:] - boxes[:, :2], axis=1)
-        frames = [item.frame for item in free]
-        lone = len(set(frames)) == len(frames)  # never two at a time: it is one person
-        tracks = [0] * len(free) if lone else bodies.followed(frames, boxes, sizes).tolist()
-        used = {track for _, track in best}
-        numbers = [n for n in range(len(used) + max(tracks) + 1) if n not in used]
-        for item, track in zip(free, tracks, strict=True):
-            key = item.frame, numbers[track]
-            best[key] = dataclasses.replace(item, track=numbers[track])
-        if len(free) > len(set(tracks)):
-            how = "one in each frame, taken as the same" if lone else "followed by their places"
-            notes = (*notes, f"{found.file}: people without tracks: {max(tracks) + 1}, {how}")
-    items = tuple(best[key] for key in sorted(best))
-    return dataclasses.replace(found, items=items, notes=notes)
 
 
 def _box_of(item: Instance, size: Size | None) -> Sequence[float]:

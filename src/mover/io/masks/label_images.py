@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from mover.core.errors import InputError
 from mover.core.pickles import load_plain
 from mover.io.capture.parts import UNKNOWN
-from mover.io.files.fields import LAST_INDEX, At, read_json
+from mover.io.files.fields import At, read_json
 from mover.io.files.images import opened
 from mover.io.files.npz import read_npy, read_npz
-from mover.io.masks.instances import Instance, Instances, Size, code_of, frames_of
+from mover.io.masks.instances import Instance, Instances, Names, Size, code_of, frames_of
 from mover.io.people.values import natural, number_in
 
 MASKS = ("masks", "pred_masks", "mask", "segmentation", "arr_0")
@@ -36,8 +36,6 @@ WHITE = (255, 65535, 0xFFFFFF)
 NEAR = 8  # values so near to black or white are black or white, where a mask is soft
 PHOTO = 0.3  # share of the pixels that are neither dark nor bright, which masks have not
 SAME = 0.5  # overlap of the same person in two frames that follow each other
-Names = Mapping[str, str]
-"""Categories where the source has none: by number, file name or index."""
 Row = tuple[NDArray[Any], Instance]
 """The pixels of a thing, and the thing without its mask."""
 
@@ -60,7 +58,8 @@ def read_label_images(
         people: Whether they show people: frames then have short numbers, too.
     """
     home = source if source.is_dir() else source.parent
-    table = {**_names_beside(home / LABELS), **names}
+    beside = read_json(home / LABELS) if (home / LABELS).is_file() else At({}, LABELS)
+    table = {**{key: beside.get(key).text() for key in beside.mapping()}, **names}
     if source.is_dir():
         paths = sorted((p for p in paths if p.stem.lower() not in NOT_MASKS), key=natural)
     homes = list(dict.fromkeys(path.parent for path in paths))
@@ -136,19 +135,8 @@ def pictures_in(folder: Path) -> list[Path]:
     return []
 
 
-def _names_beside(path: Path) -> dict[str, str]:
-    """The table of labels.json, where there is one."""
-    if not path.is_file():
-        return {}
-    at = read_json(path)
-    return {key: At(value, at.file, key).text() for key, value in at.mapping().items()}
-
-
 def _classes_beside(path: Path) -> dict[str, str]:
-    """Names of the labels of mask_data/mask_00000.npy in json_data/mask_00000.json.
-
-    As the tracking scripts of Grounded-SAM-2 write them.
-    """
+    """Names of labels of mask_data/mask_0.npy in json_data/mask_0.json, as Grounded-SAM-2 has."""
     file = path.parent.parent / "json_data" / f"{path.stem}.json"
     if path.suffix.lower() != ".npy" or not file.is_file():
         return {}
@@ -237,9 +225,6 @@ def _hardened(pixels: NDArray[np.int64], name: str, *, lossy: bool) -> NDArray[n
     return pixels
 
 
-# Arrays of masks, and dumps.
-
-
 def read_mask_arrays(path: Path, names: Names, *, people: bool = False) -> Instances:
     """Masks of an .npz, an .npy or a pickle.
 
@@ -259,7 +244,7 @@ def read_mask_arrays(path: Path, names: Names, *, people: bool = False) -> Insta
         if not rows:
             at.refuse("masks of objects in frames")
         return _gathered(rows, path.name, "masks", (int(key) for key, _ in frames))
-    given = _first(at, MASKS)
+    given = at.maybe(*MASKS)
     if given is None:
         at.refuse(f"an array named {', '.join(MASKS)}", f"the arrays {sorted(at.value)[:6]}")
     stack = given.value
@@ -288,7 +273,7 @@ def _segments(frame: int, at: At, names: Names) -> Iterator[Row]:
 
 def _of_stack(at: At, stack: NDArray[Any], names: Names, *, people: bool) -> Instances:
     """The masks of a stack: of one image, of frames that an array names, or of all frames."""
-    ids, frame = _first(at, TRACKS), at.maybe("frame")
+    ids, frame = at.maybe(*TRACKS), at.maybe("frame")
     one_id = ids is not None and isinstance(ids.value, np.ndarray) and ids.value.shape == (1,)
     height, width = stack.shape[-2:]
     flat = stack.reshape(-1, height, width)
@@ -302,12 +287,12 @@ def _of_stack(at: At, stack: NDArray[Any], names: Names, *, people: bool) -> Ins
     if in_frames or (stack.ndim == 4 and (stack.shape[1] != 1 or (one_id and frame is None))):
         count = 1 if in_frames else stack.shape[1]
         frames = np.repeat(np.arange(rows // count), count)
-        each = np.arange(count) if ids is None else _counted(ids, count)
+        each = np.arange(count) if ids is None else ids.indices(count)
         tracks = np.tile(each, rows // count)
     else:
-        frames = np.zeros(rows, dtype=np.int64) if frame is None else _counted(frame, rows)
-        tracks = None if ids is None else _counted(ids, rows)
-    words, scores = _first(at, CLASSES), at.maybe("scores")
+        frames = np.zeros(rows, dtype=np.int64) if frame is None else frame.indices(rows)
+        tracks = None if ids is None else ids.indices(rows)
+    words, scores = at.maybe(*CLASSES), at.maybe("scores")
     labels, sure = [UNKNOWN] * rows, np.ones(rows)
     if words is not None and isinstance(words.value, np.ndarray) and words.value.dtype.kind == "U":
         labels = [str(word) for word in words.array((rows,), "text")]
@@ -331,16 +316,3 @@ def _follow_each_other(flat: NDArray[Any]) -> bool:
         if least:
             shares.append(int((one & other).sum()) / least)
     return len(shares) > 0 and float(np.median(shares)) > SAME
-
-
-def _first(at: At, keys: Sequence[str]) -> At | None:
-    """The first of several names of an array that is there."""
-    return next((found for key in keys if (found := at.maybe(key)) is not None), None)
-
-
-def _counted(at: At, rows: int) -> NDArray[np.int64]:
-    """Frames or tracks, one a row."""
-    value = at.array((rows,), "whole").astype(np.int64)
-    if (value < 0).any() or (value > LAST_INDEX).any():
-        at.refuse(f"whole numbers from 0 to {LAST_INDEX}")
-    return value

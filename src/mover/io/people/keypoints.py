@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mover.bodies.keypoints import LAYOUTS as JOINTS
 from mover.core.errors import InputError
 from mover.core.types import Keypoints
-from mover.io.capture.bodies_file import indices, scalar
+from mover.io.capture.bodies_file import scalar
 from mover.io.files.fields import FASTEST, LARGEST, SLOWEST, At, read_json
 from mover.io.files.npz import read_npz, write_npz
 from mover.io.formats import chosen
@@ -29,11 +29,9 @@ LAYOUTS = {name: len(JOINTS[name]) for name in _NAMES}
 """Number of joints of each layout."""
 CENTRE = 0.5  # [px], detectors call the centre of the top-left pixel (0, 0)
 PARTS = {
-    "pose_keypoints_2d": 25,
-    "hand_left_keypoints_2d": 21,
-    "hand_right_keypoints_2d": 21,
+    "pose_keypoints_2d": 25, "hand_left_keypoints_2d": 21, "hand_right_keypoints_2d": 21,
     "face_keypoints_2d": 70,
-}
+}  # fmt: skip
 """Triples of a person of OpenPose."""
 
 
@@ -172,9 +170,6 @@ def _part(at: At, name: str, count: int) -> NDArray[np.float64]:
     return value.reshape(count, 3)
 
 
-# keypoints.npz.
-
-
 def write_keypoints(keypoints: Keypoints, path: Path) -> None:
     """Write keypoints as they are."""
     arrays: dict[str, NDArray[Any]] = {
@@ -194,7 +189,7 @@ def read_keypoints(path: Path) -> Keypoints:
     at = read_npz(path)
     word = at.get("layout")
     layout = At(str(word.array((), "text")), at.file, "layout").choice(tuple(LAYOUTS))
-    frame = indices(at.get("frame"), "B")
+    frame = torch.from_numpy(at.get("frame").indices("B"))
     if not (rows := len(frame)):
         at.get("frame").refuse("at least one row", "no rows")
     points = at.get("points").array((rows, LAYOUTS[layout], 2)).astype(np.float32)
@@ -204,6 +199,6 @@ def read_keypoints(path: Path) -> Keypoints:
         sure.refuse("numbers from 0 to 1", f"{confidence.min():g} to {confidence.max():g}")
     return Keypoints(
         points=torch.from_numpy(points), confidence=torch.from_numpy(confidence), layout=layout,
-        frame=frame, person=indices(at.get("person"), rows),
+        frame=frame, person=torch.from_numpy(at.get("person").indices(rows)),
         fps=scalar(at, "fps", SLOWEST, FASTEST),
     )  # fmt: skip

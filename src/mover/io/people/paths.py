@@ -45,9 +45,7 @@ def read_vipe(path: Path) -> At:
 def read_megasam(path: Path) -> At:
     """MegaSaM: NAME_sgd_cvd_hr.npz, or NAME_droid.npz of its first stage."""
     at = v.read_any(v.only_file(path, "*_sgd_cvd_hr.npz", "MegaSaM's result"))
-    T = v.stacked(need(at, "cam_c2w"), 4, 4)
-    K = v.rows(need(at, "intrinsic"), None, 9, 3).reshape(-1, 9)
-    return _arrays(at.file, T, np.arange(len(T)), K[:, 0] / (2 * K[:, 2]))
+    return _arrays(at.file, v.stacked(need(at, "cam_c2w"), 4, 4), focal=_focal(at))
 
 
 def read_vggt(path: Path) -> At:
@@ -55,8 +53,13 @@ def read_vggt(path: Path) -> At:
     at = v.read_any(v.only_file(path, "*.npz", "VGGT's predictions"))
     given = v.stacked(need(at, "extrinsic"), 3, 4)
     T = np.linalg.inv(affine(given[:, :, :3], given[:, :, 3]))
+    return _arrays(at.file, T, focal=_focal(at))
+
+
+def _focal(at: At) -> Array:
+    """Focal lengths of matrices of intrinsics, in widths of the image."""
     K = v.rows(need(at, "intrinsic"), None, 9, 3).reshape(-1, 9)
-    return _arrays(at.file, T, np.arange(len(T)), K[:, 0] / (2 * K[:, 2]))
+    return K[:, 0] / (2 * K[:, 2])
 
 
 def read_slam(path: Path) -> At:
@@ -72,12 +75,11 @@ def read_slam(path: Path) -> At:
     )
     value = v.numbers(at)
     if value.ndim == 3:
-        return _arrays(at.file, np.linalg.inv(v.stacked(at, 4, 4)), np.arange(len(value)))
+        return _arrays(at.file, np.linalg.inv(v.stacked(at, 4, 4)))
     row = v.rows(at, None, 7)
     if (row[:, :3] == 0).all() and (row[:, 3:] == [1, 0, 0, 0]).all():
         at.refuse("a camera that was followed (WHAM with its SLAM)", "WHAM's sign for none")
-    T = affine(_turns(row[:, 3:], at.file), row[:, :3])
-    return _arrays(at.file, T, np.arange(len(T)))
+    return _arrays(at.file, affine(_turns(row[:, 3:], at.file), row[:, :3]))
 
 
 def read_tum(path: Path) -> At:
@@ -160,9 +162,9 @@ def _turns(quaternions: Array, name: str) -> NDArray[np.float64]:
     return Rotation.from_quat(quaternions).as_matrix()
 
 
-def _arrays(name: str, T: Array, frame: Array, focal: Array | None = None) -> At:
-    """The arrays of cameras.npz under the name of the tool's own file."""
-    found = {"frame": frame, "T_world_camera": T}
+def _arrays(name: str, T: Array, frame: Array | None = None, focal: Array | None = None) -> At:
+    """The arrays of cameras.npz under the name of the tool's own file; by default of all frames."""
+    found = {"frame": np.arange(len(T)) if frame is None else frame, "T_world_camera": T}
     if focal is not None:
         found["focal"] = np.broadcast_to(focal, (len(T),)).copy()
     return At(found, name)

@@ -187,9 +187,6 @@ def _gender(at: At) -> str:
     return word
 
 
-# Where the people lie in the files of a tool.
-
-
 def _in_folder(path: Path, *names: str) -> At:
     """The file itself, or the first of these that a folder has."""
     inside = (path / name for name in names if (path / name).is_file())

@@ -20,6 +20,7 @@ from mover.io.files.fields import LARGEST, LAST_INDEX, At, existing, read_json
 from mover.io.files.npz import AMASS, is_amass, read_npz
 
 PICKLES = (".pkl", ".pickle", ".joblib", ".pt", ".pth")
+TREES = {".npz": read_npz, ".json": read_json}
 KINDS = (".npz", ".npy", *PICKLES, ".json")
 SHOWN_KEYS = 24
 LEAST_TURN = 0.05  # an array of matrices whose rows are not unit vectors within this is none
@@ -35,10 +36,8 @@ def read_any(path: Path) -> At:
     kind = existing(path).suffix.lower()
     if kind not in KINDS:
         raise InputError(f"{path.name}: is no file of kind {', '.join(KINDS)}")
-    if kind == ".npz":
-        return read_npz(path)
-    if kind == ".json":
-        return read_json(path)
+    if kind in TREES:
+        return TREES[kind](path)
     if kind in PICKLES:
         return At(load_plain(path), path.name)
     try:

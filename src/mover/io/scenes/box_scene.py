@@ -21,7 +21,7 @@ from mover.io.files.cameras import camera_of_tree
 from mover.io.files.fields import At, read_json
 from mover.io.files.images import image_size
 from mover.io.files.schema import Id, Text, checked, rotation
-from mover.io.masks.instances import Instance, Instances, objects_tree
+from mover.io.masks.instances import Instance, Instances
 from mover.io.scenes.glb_scene import up_axes
 from mover.io.scenes.placing import LEVEL, Matrix, Pieces, Placed, about_y
 
@@ -89,12 +89,10 @@ def _placed(at: At, box: BoxFields, turn: Matrix, index: int, _key: str) -> Plac
     centre = turn @ np.array(box.center)
     place = centre - np.array([0.0, size[1] / 2, 0.0])  # the library stands on its bottom
     fields = {
-        "annotation": None if box.box2d is None else index,
-        "translation": place.tolist(),
-        "yaw": yaw,
-        "scale": (size / (high - low)).tolist(),
+        "annotation": None if box.box2d is None else index, "translation": place.tolist(),
+        "yaw": yaw, "scale": (size / (high - low)).tolist(),
         "support": "ground" if box.support is None else str(box.support),
-    }
+    }  # fmt: skip
     return fields, (mesh, ""), ""
 
 
@@ -121,4 +119,4 @@ def _annotations(boxes: Sequence[BoxFields], camera: At | None, file: str) -> At
         for box in boxes
     )
     size = camera.get("w").integer(1), camera.get("h").integer(1)
-    return objects_tree(Instances(found, size, file), found)
+    return Instances(found, size, file).objects_tree()

@@ -8,7 +8,6 @@ that were written with y down or z up are turned by --up.
 import dataclasses
 import math
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from mover.io.files.fields import At, reason
 from mover.io.files.images import image_size
 from mover.io.files.looks import gltf_tree, load_parts, looks_lost
 from mover.io.people.values import natural
-from mover.io.scenes.placing import FLIP, Matrix, Pieces, category_of_name, placed
+from mover.io.scenes.placing import FLIP, Matrix, Pieces, category_of_name
 
 UP: dict[str, Matrix] = {
     "y": np.eye(3),
@@ -55,7 +54,7 @@ def glb_parts(path: Path, hints: Hints) -> Parts:
     for node in _nodes(scene):
         category = hints.names.get(node) or category_of_name(node)
         matrix = turn @ np.asarray(scene.graph[node][0])
-        found.add(category, node, partial(placed, _below(scene, node), matrix, hints.work))
+        found.add_parts(category, node, _below(scene, node), matrix, hints.work)
     if not found.rows:
         raise InputError(f"{path.name}: has no meshes, expected a glTF scene of furniture")
     parts = found.parts(path.stem, path.name, _ground(scene, turn))

@@ -103,6 +103,10 @@ class Pieces:
         self.notes.extend([f"{key}: {note}"] if note else [])
         self.rows.append({"id": key, "category": category, "mesh": key, **fields})
 
+    def add_parts(self, category: str, name: str, scene: Any, matrix: Matrix, work: Path) -> None:  # noqa: ANN401
+        """Append the object of parts that a matrix takes into the world."""
+        self.add(category, name, partial(placed, scene, matrix, work))
+
     def parts(self, name: str, file: str, ground: float | None = None) -> Parts:
         """Parts of a capture with these objects."""
         tree = scene_tree(self.rows, file, ground)

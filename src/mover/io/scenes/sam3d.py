@@ -10,7 +10,6 @@ the tool's depth, which may not be metric.
 import dataclasses
 import math
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,28 +18,18 @@ from mover.core.errors import InputError
 from mover.geometry.rotations import affine
 from mover.io.capture.parts import Hints, Parts
 from mover.io.files.cameras import GUESSED, read_camera_file, with_spread
-from mover.io.files.fields import At, listed, read_json
+from mover.io.files.fields import At, listed
 from mover.io.files.images import image_size
 from mover.io.files.looks import is_cloud, load_parts, looks_lost
 from mover.io.files.meshes import KINDS
-from mover.io.files.npz import read_npz
 from mover.io.files.schema import rotation
-from mover.io.scenes.placing import (
-    LEVEL,
-    MOST_TILT,
-    Matrix,
-    Pieces,
-    category_of_name,
-    level_of,
-    placed,
-)
+from mover.io.people.values import TREES
+from mover.io.scenes.placing import LEVEL, MOST_TILT, Matrix, Pieces, category_of_name, level_of
 
 TO_LOCAL = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 """The stored mesh (+y up) -> the frame of the pose (+z up)."""
 TO_OPENCV = np.diag([-1.0, -1.0, 1.0])
 """PyTorch3D's camera (x left, y up) -> x right, y down."""
-POSES = {".npz": read_npz, ".json": read_json}
-"""What the pose beside a mesh may be."""
 PEOPLE = ("human", "person", "body")
 """Names of meshes that are people, in folders of the tool's notebooks."""
 
@@ -67,7 +56,7 @@ def sam3d_parts(folder: Path, hints: Hints) -> Parts:
         said = next((at.text() for at in words if at is not None), None)
         name = hints.names.get(path.stem) or said or category_of_name(path.stem)
         parts = load_parts(At(path.name, folder.name), path)
-        found.add(name, path.stem, partial(placed, parts, affine(R.T) @ matrix, hints.work))
+        found.add_parts(name, path.stem, parts, affine(R.T) @ matrix, hints.work)
         notes += [lost] if (lost := looks_lost(path)) else []
     if camera is not None:
         camera = At({**camera.value, "R_cam_world": R.tolist()}, camera.file)
@@ -105,7 +94,7 @@ def _things(folder: Path) -> tuple[list[Path], list[str]]:
 
 def _pose_beside(path: Path) -> At:
     """The pose beside a mesh, arrays as lists."""
-    for kind, read in POSES.items():
+    for kind, read in TREES.items():
         own = path.with_suffix(kind)
         if own.is_file():
             at = read(own)

@@ -188,13 +188,11 @@ def total3d_parts(folder: Path, hints: Hints) -> Parts:
         return mesh_of(*shapes[at.value], At(None, at.value)), str((result / at.value).resolve())
 
     return Parts(
-        name=folder.resolve().name,
-        camera=_camera(source, result / "r_ex.mat"),
+        name=folder.resolve().name, camera=_camera(source, result / "r_ex.mat"),
         scene=scene_tree(rows, result.name, floor),
-        objects=At(_annotations(at.items(), list(kept)), "detections.json"),
-        load_mesh=load,
+        objects=At(_annotations(at.items(), list(kept)), "detections.json"), load_mesh=load,
         load_image=partial(read_image, At("img.jpg", "input"), source),
-    )
+    )  # fmt: skip
 
 
 def _camera(source: Path, attitude: Path) -> At:
