@@ -10,19 +10,15 @@ from test_pipeline import light, run_in
 from mover.core.types import Capture, Masks, Mesh
 from mover.geometry.camera import to_camera
 from mover.geometry.rle import decode
-from mover_bench.experiment.variants import shortened
-from mover_bench.rooms.config import NoiseConfig
-from mover_bench.rooms.noise import add_noise
 from mover_bench.rooms.render import encode
 
 pytestmark = pytest.mark.slow
-FRAMES = 60  # a person walks and sits
 GROWN = 8  # 480 x 270 to 3,840 x 2,160
 
 
-@pytest.fixture(scope="module")
-def capture(small_room) -> Capture:
-    return shortened(add_noise(small_room, NoiseConfig(), 1), torch.arange(FRAMES))
+@pytest.fixture
+def capture(small_capture) -> Capture:
+    return small_capture
 
 
 def changed(capture: Capture, **fields: object) -> Capture:

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from kept_rooms import thinned
 from test_pipeline import light
 
 from mover.core.run import Run
@@ -293,7 +294,7 @@ def test_a_capture_keeps_what_it_says_of_its_lens(small_room, tmp_path):
 
 @pytest.mark.slow
 def test_a_room_under_a_guessed_lens_is_rebuilt_under_a_better_one(small_room, tmp_path):
-    guessed = wrong_lens(small_room.capture, 0.055, np.random.default_rng(2))
+    guessed = wrong_lens(thinned(small_room.capture), 0.055, np.random.default_rng(2))
     given, true = guessed.scene.camera.K[0, 0], small_room.truth.camera.K[0, 0]
     config = light("robust", steps=4)  # the lens is found before anything is placed
     room = reconstruct(guessed, config, Run(tmp_path / "asked"))

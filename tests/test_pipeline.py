@@ -25,8 +25,6 @@ from mover.io.formats import read
 from mover.pipeline.presets import PRESETS
 from mover.pipeline.reconstruct import reconstruct
 from mover.stages.objects.place_inputs import Placed
-from mover_bench.rooms.config import NoiseConfig
-from mover_bench.rooms.noise import add_noise
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 PHOTO, TOTAL3D = SHARED / "photo_bench", SHARED / "total3d_1"
@@ -50,9 +48,9 @@ def light(name, steps=15):
 
 
 @pytest.fixture(scope="module")
-def capture_folder(tmp_path_factory, small_room):
+def capture_folder(tmp_path_factory, small_room, small_capture):
     folder = tmp_path_factory.mktemp("capture")
-    write_capture(add_noise(small_room, NoiseConfig(), 1), folder)
+    write_capture(small_capture, folder)
     write_truth(small_room.truth, small_room.bodies, folder / "truth")
     return folder
 

@@ -13,7 +13,7 @@ from test_pipeline import light
 
 from mover.bodies.parts import parts_of
 from mover.core.run import Run
-from mover.core.types import Layout
+from mover.core.types import Capture, Layout
 from mover.pipeline.reconstruct import reconstruct
 from mover.stages.objects.gather_given import gather_given
 from mover.stages.objects.room_scale import (
@@ -23,9 +23,6 @@ from mover.stages.objects.room_scale import (
     common_scale,
     seat_height_estimate,
 )
-from mover_bench.rooms.config import NoiseConfig
-from mover_bench.rooms.known import KnownRoom
-from mover_bench.rooms.noise import add_noise
 
 ROOM = 0.0
 
@@ -112,13 +109,12 @@ def test_more_seat_height_estimate_more() -> None:
 
 @pytest.mark.slow
 def test_a_room_of_people_of_unknown_height_says_how_uncertain_it_is(
-    small_room: KnownRoom, tmp_path: Path
+    small_capture: Capture, tmp_path: Path
 ) -> None:
-    known = add_noise(small_room, NoiseConfig(), 0)
-    unknown = replace(known, bodies=replace(known.bodies, size_spread=0.06))
+    unknown = replace(small_capture, bodies=replace(small_capture.bodies, size_spread=0.06))
     given = [
         [w for w in reconstruct(capture, light("robust"), Run(tmp_path)).warnings if "heights" in w]
-        for capture in (known, unknown)
+        for capture in (small_capture, unknown)
     ]
     assert given[0] == []
     (warning,) = given[1]

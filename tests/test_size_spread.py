@@ -4,6 +4,7 @@ from dataclasses import dataclass, field, replace
 
 import pytest
 import torch
+from kept_rooms import thinned
 from test_pipeline import light
 
 from mover.core.run import Run
@@ -103,7 +104,7 @@ class Weighing(Run):
 @pytest.mark.slow
 def test_all_stages_after_the_first_trust_wrong_sizes_less(small_room, tmp_path):
     run, config = Weighing(tmp_path), light("robust")
-    reconstruct(add_noise(small_room, NoiseConfig(scale=0.35), 1), config, run)
+    reconstruct(thinned(add_noise(small_room, NoiseConfig(scale=0.35), 1)), config, run)
     names, scales, growths = zip(*run.weighed, strict=True)
     rounds = ["refine_camera", "place_objects"] * config.refine.rounds
     assert names == ("place_objects", *rounds, *["place_objects"] * 2)

@@ -207,23 +207,20 @@ def test_heights_are_told_to_the_room_by_track(tmp_path: Path):
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("quick")
 def test_a_video_becomes_a_room_and_files_that_are_replaced_stay(
-    tmp_path: Path, small_room, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, small_room, capsys: pytest.CaptureFixture[str]
 ):
     pytest.importorskip("cv2")
     pytest.importorskip("av")
-    from test_pipeline import light
-
     from mover.app.pictures.film import save_film
     from mover.core.records import rows_of
-    from mover.pipeline.presets import PRESETS
     from mover_bench.rooms.config import NoiseConfig
     from mover_bench.rooms.known import draw_frame
     from mover_bench.rooms.noise import add_noise
     from mover_bench.rooms.seen import Seen
 
-    monkeypatch.setitem(PRESETS, "robust", light("robust"))
-    video, out, frames = tmp_path / "room.mp4", tmp_path / "out", 120
+    video, out, frames = tmp_path / "room.mp4", tmp_path / "out", 60
     save_film((draw_frame(small_room, k) for k in range(frames)), small_room.bodies.fps, video)
     bodies = rows_of(small_room.bodies, small_room.bodies.frame < frames)
     finders = Seen(small_room, add_noise(small_room, NoiseConfig(), 1), 1).finders()

@@ -24,7 +24,6 @@ from filmed import (
     write_film,
 )
 from PIL import Image
-from test_pipeline import light
 
 from mover.app.cli.video import VideoArgs, video_to_room
 from mover.core.errors import InputError
@@ -42,7 +41,6 @@ from mover.perceive.mediapipe import PoseInputs, Poses
 from mover.perceive.networks import DetectInputs, Finds, link_people
 from mover.perceive.own import Own
 from mover.perceive.video import TakeInputs, stamp_of, take_frames
-from mover.pipeline.presets import PRESETS
 
 pytest.importorskip("cv2")
 SECOND = 30
@@ -292,12 +290,6 @@ def test_frames_without_time_stamps_are_counted(tmp_path: Path):
     assert (found.points[..., 0].mean(-1) - 10 - true).abs().max() < 1.5
 
 
-@pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rooms with few steps: they are asked whether they are there, not how well they are placed."""
-    monkeypatch.setitem(PRESETS, "robust", light("robust"))
-
-
 def room_of(args: VideoArgs, finders: Finders = FINDERS) -> Scene:
     video_to_room(args, finders)
     assert (args.out / "room" / "report.html").is_file()
@@ -305,6 +297,7 @@ def room_of(args: VideoArgs, finders: Finders = FINDERS) -> Scene:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("quick")
 def test_without_people_the_picture_alone_places_the_furniture_and_that_is_said(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

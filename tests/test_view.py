@@ -41,14 +41,12 @@ def call(*arguments: object) -> None:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory, small_room) -> Path:
+def folder(tmp_path_factory, small_capture) -> Path:
     """A small capture, its settings, and its result in `out`."""
     from mover.io.capture.folder import write_capture
-    from mover_bench.rooms.config import NoiseConfig
-    from mover_bench.rooms.noise import add_noise
 
     folder = tmp_path_factory.mktemp("view")
-    write_capture(add_noise(small_room, NoiseConfig(), 1), folder / "capture")
+    write_capture(small_capture, folder / "capture")
     config, slow = light("robust"), Adam(15, 0.03)
     config = dataclasses.replace(
         config,
