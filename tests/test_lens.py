@@ -52,8 +52,13 @@ def lines_in(picture, masks=None):
 
 
 @functools.cache
-def drawn(heading, seed, boxes=9, askew=0, only=None, off=(0.0, 0.0), solid=False):
-    """Lines of a picture of boxes' edges by OpenCV, which shares nothing with the method.
+def drawn(heading, seed, **boxes):
+    """Lines of a picture of boxes' edges."""
+    return lines_in(*picture_of(heading, seed, **boxes))
+
+
+def picture_of(heading, seed, boxes=9, askew=0, only=None, off=(0.0, 0.0), solid=False):
+    """Boxes' edges by OpenCV, which shares nothing with the method.
 
     Solid boxes hide each other, and have masks.
     """
@@ -85,7 +90,7 @@ def drawn(heading, seed, boxes=9, askew=0, only=None, off=(0.0, 0.0), solid=Fals
                 cv2.line(picture, *ends, (60, 70, 80), 2, cv2.LINE_AA, 4)
     noisy = picture + rng.normal(0, 4, picture.shape)
     masks = torch.from_numpy(label) == torch.arange(1, len(made) + 1)[:, None, None]
-    return lines_in(torch.from_numpy(noisy.clip(0, 255) / 255).float(), masks if solid else None)
+    return torch.from_numpy(noisy.clip(0, 255) / 255).float(), masks if solid else None
 
 
 def lens_of(segments: Segments, focal: float, spread: float | None):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from test_lens import FOCAL, camera_of, drawn
+from test_lens import FOCAL, camera_of, picture_of
 from tiny_models import tiny_mask2former, tiny_vitpose
 
 from mover.core.run import Run
@@ -124,7 +124,7 @@ def test_jumps_ask_for_more_frames_a_second_and_walks_do_not(fps: float, dense: 
 
 @pytest.mark.parametrize(("spread", "taken"), [(0.055, True), (0.0, False), (None, False)])
 def test_the_lens_of_the_lines_counts_before_bodies_are_fitted(spread: float | None, taken: bool):
-    picture, said = drawn(0.5, seed=1), list[str]()
+    (picture, _), said = picture_of(0.5, seed=1), list[str]()
     clean = Clean(picture, torch.zeros(picture.shape[:2], dtype=torch.bool))
     guess = camera_of(1.08 * FOCAL, -0.1)
     found, left = lens_by_lines(guess, spread, clean, said.append)
