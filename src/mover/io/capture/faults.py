@@ -49,6 +49,7 @@ UNITS = {"feet": 3.2808, "decimetres": 10.0, "inches": 39.37, "centimetres": 100
 POOR = 0.2  # mean overlap below which parts of a capture are of different pictures
 POOR_OBJECTS = 0.4  # the same of objects: initial scenes of known and real rooms have .46 and more
 MISSED = 0.1  # overlap below which an object is not at its annotation: those have .23 and more
+FITTED_TIME = 0.35  # mean overlap that other times must reach: another video's reach .18
 FITS = 0.45  # mean overlap that another lens must reach: other pictures reach .34
 FEWEST = 3  # outlines that show a lens, rows that show a time
 SCALES = 1.03 ** torch.arange(-55.0, 56.0)  # between lenses, or sizes
@@ -255,6 +256,8 @@ def _times(capture: Capture, found: Agreement) -> Iterator[Fault]:
     shared = (rows >= 0).sum(1)
     fits = fits.where(rows >= 0, torch.zeros(())).sum(1) / shared.clamp_min(1)
     fits[shared < max(FEWEST, int(shared.max()) / 2)] = -1
+    if float(fits.max()) < FITTED_TIME:
+        return
     name = list(changes)[int(fits.argmax())]
     cure = "number the frames of bodies and masks as those of one video (--fps), from 0"
     yield Fault(f"bodies.npz: {name}", cure, partial(mends.retimed, *changes[name]), TIME_MARGIN)
