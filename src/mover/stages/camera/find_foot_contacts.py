@@ -110,10 +110,11 @@ def _lower_feet(inputs: FootContactInputs, config: FootContactConfig) -> _LowerF
     bodies, up = inputs.bodies, inputs.camera.R_cam_world[:, 1].to(inputs.bodies.verts)
     straight = straight_legs(bodies, inputs.parts, up)
     points, still, height = [], [], []
-    for side in SIDES:
-        sole = members(inputs.parts, f"{side}_sole")
-        verts = bodies.verts[:, sole] if bool(sole.any()) else bodies.verts
-        lowest = (verts @ up).topk(min(POINTS, verts.shape[1]), dim=1, largest=False)
+    soles = [members(inputs.parts, f"{side}_sole") for side in SIDES]
+    feet = [bodies.verts[:, sole] if bool(sole.any()) else bodies.verts for sole in soles]
+    count = min(POINTS, *(verts.shape[1] for verts in feet))  # of each foot
+    for verts in feet:
+        lowest = (verts @ up).topk(count, dim=1, largest=False)
         points.append(verts.take_along_dim(lowest.indices[..., None], 1))
         height.append(lowest.values.mean(1))
         still.append(_still(verts.mean(1), bodies, config.speed))
