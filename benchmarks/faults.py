@@ -223,10 +223,8 @@ FAULTS: dict[str, tuple[str, Change]] = {
 def of_another(capture: Capture, second: Capture) -> dict[str, tuple[str, Capture | None]]:
     """Parts of another capture in this one."""
     bodies, camera = second.bodies, second.scene.camera
-    same = (camera.width, camera.height) == (
-        capture.scene.camera.width,
-        capture.scene.camera.height,
-    )
+    own = capture.scene.camera
+    same = (camera.width, camera.height) == (own.width, own.height)
     known = {d.id for d in second.detections}
     lone = all(one.annotation in known or one.annotation is None for one in capture.scene.objects)
     swapped = replace(capture, scene=replace(capture.scene, objects=second.scene.objects))
@@ -252,10 +250,8 @@ def main() -> None:
         rooms[name] = lambda kind=kind, seed=seed: noisy_room(int(seed), SETS[kind]).capture
     found: dict[str, list[bool]] = {name: [] for name in FAULTS}
     alarms: list[str] = []
-    for name, room in {
-        **rooms,
-        **{str(p): partial(read_capture, p) for p in args.unharmed},
-    }.items():
+    unharmed = {str(path): partial(read_capture, path) for path in args.unharmed}
+    for name, room in (rooms | unharmed).items():
         capture = room()
         alarms += [f"{name}: {text}" for text in check_against_picture(capture).warnings]
         for fault, (words, change) in FAULTS.items() if name in rooms else ():

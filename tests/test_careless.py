@@ -126,6 +126,13 @@ def test_depth_that_no_room_has_is_refused(value: float, words: str, folder: Pat
         read_capture(folder)
 
 
+@pytest.mark.parametrize(("one", "other"), [("scene", "objects"), ("objects", "scene")])
+def test_files_in_one_anothers_place_are_named(one: str, other: str, folder: Path) -> None:
+    (folder / f"{one}.json").write_bytes((folder / f"{other}.json").read_bytes())
+    with pytest.raises(InputError, match=rf"{one}.json has .* \(is it {other}.json\?\)"):
+        read_capture(folder)
+
+
 def test_two_cameras_of_a_capture_are_said(folder: Path) -> None:
     tree = json.loads((folder / "camera.json").read_text())
     scene = json.loads((folder / "scene.json").read_text())

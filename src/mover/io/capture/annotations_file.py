@@ -63,6 +63,8 @@ def image_name(at: At) -> At | None:
 
 def _only_image(at: At) -> At:
     """The one image of objects.json."""
+    if at.maybe("images") is None and at.maybe("objects") is not None:
+        at.refuse("COCO's annotations", "a scene (is it scene.json?)")
     images = at.get("images").items()
     if len(images) > 1:
         named = [shown(image.get("file_name").value) for image in images[:3]]

@@ -93,6 +93,8 @@ def scene_of(at: At, load: LoadMesh, camera: Camera | None, warn: Warn) -> tuple
     Returns:
         The scene and the angle by which the world was turned about +y [rad].
     """
+    if at.maybe("format") is None and at.maybe("annotations") is not None:
+        at.refuse("a scene with 'format' and 'objects'", "COCO's annotations (is it objects.json?)")
     fields = checked(at, SceneFields)
     if fields.camera is not None:
         camera = camera_of(at.get("camera"), camera)
