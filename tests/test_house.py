@@ -19,7 +19,7 @@ LINES = {
     "src/mover/bodies": 2_058,
     "src/mover/core": 1_613,
     "src/mover/energy": 3_820,
-    "src/mover/evaluate": 1_090,
+    "src/mover/evaluate": 1_094,
     "src/mover/extensions": 1_235,
     "src/mover/fitting": 2_142,
     "src/mover/furniture": 961,

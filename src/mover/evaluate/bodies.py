@@ -3,6 +3,8 @@
 Both are measured in the gravity-aligned worlds of their scenes, without alignment.
 """
 
+import math
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -61,12 +63,12 @@ def v2v(twins: Twins) -> float | None:
 
 def p_pje(twins: Twins) -> float | None:
     """Mean distance of the joints [m] after the best similarity transform of each body."""
-    return _distance(_aligned(twins.joints, twins.true_joints), twins.true_joints)
+    return _distance(twins.joints, twins.true_joints, aligned=True)
 
 
 def p_v2v(twins: Twins) -> float | None:
     """Mean distance of the vertices [m] after the best similarity transform of each body."""
-    return _distance(_aligned(twins.verts, twins.true_verts), twins.true_verts)
+    return _distance(twins.verts, twins.true_verts, aligned=True)
 
 
 GROUND_METRICS: dict[str, Metric[Standing]] = {
@@ -146,14 +148,14 @@ def _keys(bodies: Bodies) -> list[tuple[int, int]]:
 AT_ONCE = 16  # bodies that are aligned together: what fits a processor's cache
 
 
-def _aligned(points: Tensor | None, target: Tensor | None) -> Tensor | None:
-    if points is None or target is None or not len(points):
-        return points
-    pairs = zip(points.split(AT_ONCE), target.split(AT_ONCE), strict=True)
-    return torch.cat([procrustes(some, there) for some, there in pairs])
-
-
-def _distance(points: Tensor | None, target: Tensor | None) -> float | None:
+def _distance(
+    points: Tensor | None, target: Tensor | None, *, aligned: bool = False
+) -> float | None:
+    """Mean distance of corresponding points [m], as they are or after each body's similarity."""
     if points is None or target is None:
         return None
-    return float((points - target).norm(dim=-1).mean())
+    total, count = 0.0, points[..., 0].numel()
+    for some, there in zip(points.split(AT_ONCE), target.split(AT_ONCE), strict=True):
+        moved = procrustes(some, there) if aligned else some
+        total += float((moved - there).norm(dim=-1).double().sum())
+    return total / count if count else math.nan

@@ -19,6 +19,7 @@ from mover.geometry.volume import signed_distance
 from mover.geometry.watertight import close_mesh
 
 Furniture = Sequence[StandingMesh]
+BLOCK = 64  # bodies that are measured at once: memory stays that of these
 
 
 @record
@@ -131,19 +132,20 @@ def nearness(
 
     Furniture that is moved is measured where it stands in the frame of each body.
     """
-    points, per = verts.reshape(-1, 3), verts.shape[1]
-    signed = torch.full_like(points[:, 0], torch.inf)
+    signed = torch.full_like(verts[..., 0], torch.inf)
     surface = signed.clone()
-    for there in furniture:  # one tree for each mesh: there is no batched exact distance
-        mesh, now = there.mesh, there.when(frame)
-        low, high = mesh.verts.amin(0) - reach, mesh.verts.amax(0) + reach
-        inside = ((points >= low) & (points <= high)).all(-1)
-        close = (inside & now.repeat_interleave(per)).nonzero()[:, 0]
-        if len(close):
-            distance = signed_distance(points[close], mesh.verts, mesh.faces).to(signed)
-            signed[close] = torch.minimum(signed[close], distance)
-            surface[close] = torch.minimum(surface[close], distance.abs())
-    return Nearness(signed.reshape(verts.shape[:2]), surface.reshape(verts.shape[:2]))
+    for first in range(0, len(verts), BLOCK):
+        part = slice(first, first + BLOCK)
+        points, deep, near = verts[part], signed[part], surface[part]  # filled in place
+        for there in furniture:  # one tree for each mesh: there is no batched exact distance
+            mesh, now = there.mesh, there.when(frame[part])
+            low, high = mesh.verts.amin(0) - reach, mesh.verts.amax(0) + reach
+            close = ((points >= low) & (points <= high)).all(-1) & now[:, None]
+            if bool(close.any()):
+                distance = signed_distance(points[close], mesh.verts, mesh.faces).to(signed)
+                deep[close] = torch.minimum(deep[close], distance)
+                near[close] = torch.minimum(near[close], distance.abs())
+    return Nearness(signed, surface)
 
 
 def evenly(rows: int, count: int) -> Int[Tensor, " picked"]:
