@@ -43,7 +43,7 @@ class RunArgs:
     format: str = "folder"
     """How the capture is written; see docs/data.md."""
     preset: str = "robust"
-    """paper or robust: the settings that the other flags change."""
+    """paper, printed or robust: the settings that the other flags change."""
     config_from: Annotated[Path | None, arg(name="config")] = None
     """A file of settings (a run.json) in place of a preset; it may set what has no flag, too."""
     edits: Path | None = None
@@ -126,7 +126,7 @@ class BatchArgs:
     format: str = "folder"
     """How the captures are written; see docs/data.md."""
     preset: str = "robust"
-    """paper or robust: the settings that the other flags change."""
+    """paper, printed or robust: the settings that the other flags change."""
     config_from: Annotated[Path | None, arg(name="config")] = None
     """A file of settings (a run.json) in place of a preset; it may set what has no flag, too."""
     refine: bool = False
@@ -182,7 +182,7 @@ class DemoArgs:
     out: Path = Path("demo")
     """Folder for the capture and the result."""
     preset: str = "robust"
-    """paper or robust."""
+    """paper, printed or robust."""
     device: Device = "cpu"
     """cpu, cuda or auto."""
 

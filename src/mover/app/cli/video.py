@@ -190,7 +190,7 @@ class VideoArgs:
     meshes: Path | None = None
     """Folder with your own shapes, named after their class: chair_0.obj."""
     preset: str = "robust"
-    """Settings of the room: paper or robust."""
+    """Settings of the room: paper, printed or robust."""
     device: Device = "cpu"
     """Where the room is computed: cpu, cuda or auto."""
 
