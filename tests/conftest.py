@@ -1,5 +1,4 @@
 import sys
-from functools import partial
 from importlib.machinery import PathFinder
 
 import pytest
@@ -77,7 +76,7 @@ def quick(monkeypatch):
     from mover.fitting.config import FITS
     from mover.pipeline.presets import PRESETS
 
-    monkeypatch.setattr(video, "LayoutArgs", partial(video.LayoutArgs, config=LAYOUT))
+    monkeypatch.setattr(video, "LayoutConfig", lambda: LAYOUT)
     monkeypatch.setitem(PRESETS, "robust", light("robust"))
     monkeypatch.setitem(FITS, "robust", QUICK)
 
