@@ -179,11 +179,6 @@ def winding(verts: np.ndarray, faces: np.ndarray, shape: np.ndarray) -> np.ndarr
     return steps[..., :-1].cumsum(2, dtype=np.int32).swapaxes(1, 2)
 
 
-REACH = 2  # [cells], that the shell reaches out of the body
-FAR = 1e6  # [cells]
-SLIVER = 1e-9  # squared sine of an angle below which a triangle has no area
-
-
 def union_bodies(
     verts: Float[Tensor, "bodies verts 3"],
     faces: Int[Tensor, "faces 3"],
@@ -228,9 +223,11 @@ def union_bodies(
 
 def _mesh(verts: Tensor, corners: Tensor) -> Any:  # noqa: ANN401
     """Warp's mesh, whose vertices follow the bodies, without the triangles that have no area."""
+    from mover.geometry.kernels.bodies import SLIVER
+
     a, b, c = verts[corners.long()].unbind(-2)
     square = torch.linalg.cross(b - a, c - a).square().sum(-1)
-    flat = square <= SLIVER * (b - a).square().sum(-1) * (c - a).square().sum(-1)
+    flat = square <= SLIVER**2 * (b - a).square().sum(-1) * (c - a).square().sum(-1)
     some = corners if bool(flat.all()) else corners[~flat]
     return started().Mesh(array(verts.clone(), "vec3"), array(some.flatten(), "int32"))
 
@@ -244,11 +241,11 @@ def add_body(
     """Lower a volume, in place, to the signed distance of one body [m]."""
     from mover.geometry.kernels import bodies
 
-    wp, device = started(), verts.device
+    wp, device, reach = started(), verts.device, int(bodies.SHELL)
     place = (verts.double() - volume.origin.to(device).double()) / volume.cell
     last = torch.tensor(volume.values.shape) - 1
-    low = (place.amin(0).floor().cpu().long() - REACH).clamp_min(0)
-    high = torch.minimum(place.amax(0).ceil().cpu().long() + REACH, last)
+    low = (place.amin(0).floor().cpu().long() - reach).clamp_min(0)
+    high = torch.minimum(place.amax(0).ceil().cpu().long() + reach, last)
     if bool((high < low).any()):
         return
     place = place - low.to(place)
@@ -261,7 +258,7 @@ def add_body(
     body.low, body.size = wp.vec3i(*low.tolist()), wp.vec3i(*size)
     steps = torch.zeros(*shape[:2], shape[2] + 1, dtype=torch.int32, device=device)
     body.winding = array(steps, "int32")
-    near = torch.full(shape, FAR, device=device)
+    near = torch.full(shape, bodies.FAR, device=device)
     body.near = array(near, "float32")
     at = place.float()
     wp.copy(mesh.points, array(at, "vec3"))

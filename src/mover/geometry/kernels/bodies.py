@@ -8,10 +8,10 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-SHELL = wp.constant(2.0)  # [cells], see `volume.SHELL`
-FAR = wp.constant(1.0e6)
+SHELL = wp.constant(2.0)  # [cells], up to where it is exact outside: more than a cell's diagonal
+FAR = wp.constant(1.0e6)  # [cells]
 TINY = wp.constant(1.0e-12)
-SLIVER = wp.constant(3.2e-5)  # sine of an angle below which a triangle has no area
+SLIVER = wp.constant(1.0e-9**0.5)  # sine of an angle below which a triangle has no area
 MORE = wp.constant(0.001)  # [cells], far more than the rounding of a distance
 SNAP = wp.constant(wp.float64(65536.0))  # vertices snap to this part of a cell, for exact crossings
 BITS = wp.constant(wp.int64(16))
