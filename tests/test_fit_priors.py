@@ -20,8 +20,16 @@ from mover.fitting.bodies import FitInputs, fit_bodies
 from mover.fitting.config import STAGES, FitConfig, Stage
 from mover.fitting.energy import HEIGHT, UPPER, Seen
 from mover.fitting.noise import FEW, at_most, bias_of, noise_of, without
-from mover.fitting.priors import excess_of, limit_table, off_pose, resting, spreads
-from mover.fitting.start import BACK, lying_guesses, turned_round, upright_guesses
+from mover.fitting.priors import (
+    HIPS,
+    KNEES,
+    excess_of,
+    limit_table,
+    off_pose,
+    resting,
+    spreads,
+)
+from mover.fitting.start import BACK, LEGS, lying_guesses, turned_round, upright_guesses
 from mover.fitting.tracks import CALM, joint_speed, motion_of, stages_of
 from mover.fitting.unknowns import NO_FLOOR, Frame, Unknowns, floor_of, rig_of
 from mover.geometry.rotations import axis_angle, rot_x, rot_y, rot_z, rotation_vectors
@@ -188,6 +196,7 @@ def test_only_lying_people_have_arms_anywhere_in_their_ranges():
     for guess in lying_guesses(like, BACK):
         np.testing.assert_allclose(guess.spread[arms], drawn[arms.numpy()], rtol=0.01)
         assert torch.equal(guess.spread[~arms], usual[~arms])
+    usual[[*HIPS, *KNEES]] = LEGS
     assert all(torch.equal(guess.spread, usual) for guess in upright_guesses(like))
 
 

@@ -155,7 +155,8 @@ def test_a_detectors_word_has_all_its_meanings_in_any_spelling() -> None:
     for name in ("chair", "Chairs", "SM_Chair_02"):
         assert meanings(name) == ("chair", "armchair", "office chair", "stool")
     assert meanings("DiningTables") == ("table", "coffee table", "desk")
-    assert meanings("table") == ("table",)
+    assert meanings("table") == ("table", "coffee table", "desk")
+    assert meanings("bett") == ("bed",)
 
 
 def test_a_name_that_means_nothing_is_said_with_the_nearest_known_one() -> None:

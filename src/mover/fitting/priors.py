@@ -117,6 +117,7 @@ def off_pose(
 
 
 ADULT, ADULTS = 1.68, 0.10  # [m], mean and spread of adults of either sex (NCD-RisC 2016)
+HELD = 0.04  # [m], by which proportions move an unknown height: they hardly show it
 UNKNOWN = ADULTS / ADULT  # standard deviation of the logarithm of an unknown height
 BONES = 4.6  # [m], the 21 bones of a usual person end to end
 
@@ -173,7 +174,7 @@ def shape_cost(stature: Stature, betas: Float[Tensor, "people shape"]) -> Float[
     """
     dirs = stature.dirs[: betas.shape[1]].to(betas)
     along = betas @ dirs / dirs.norm()
-    off = (stature.heights(betas) - ADULT) / ADULTS
+    off = (stature.heights(betas) - ADULT) / HELD
     unknown = stature.given.isnan().to(betas.device)
     rest = (betas.square().sum(-1) - along.square()).clamp_min(0)
     return rest + torch.where(unknown, off, torch.zeros_like(off)).square()

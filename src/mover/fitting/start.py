@@ -34,7 +34,7 @@ from mover.energy.body_terms import robust_square
 from mover.fitting.config import FitConfig, Stage
 from mover.fitting.energy import FitState, Seen
 from mover.fitting.ground import LIES, NEIGHBOURS, SITS, trunk_of
-from mover.fitting.priors import resting, spreads
+from mover.fitting.priors import HIPS, KNEES, resting, spreads
 from mover.fitting.tracks import best_path, every_so_often
 from mover.fitting.unknowns import Frame, Rig, Unknowns, place_of, points_of, solve
 from mover.geometry.camera import project
@@ -48,6 +48,9 @@ STANDING = {"hip": (0, -10.0), "knee": (0, 15.0), "elbow": (1, -25.0)}
 the mean of a gait cycle (hips 10, knees 20; Perry, Burnfield: Gait Analysis, 2010)."""
 SEATED = {"hip": (0, -80.0), "knee": (0, 85.0)}
 """Of a seated person."""
+LEGS = math.radians(18)
+"""By which hips and knees bend differently, as over a gait cycle. With the spread of all postures
+legs bend where their keypoints are closer together than the model's, and the body comes nearer."""
 ARMS = ("shoulder",)
 """Hang by their weight where the trunk is upright; those of lying people may be anywhere."""
 TORSO = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
@@ -105,7 +108,8 @@ class Tried(FitStart):
 
 def upright_guesses(like: Tensor) -> list[Guess]:
     """Standing and sitting people who face four ways."""
-    turns, usual = rot_y(torch.tensor(YAWS).to(like)).unbind(0), spreads(1, like)[0]
+    turns, usual = rot_y(torch.tensor(YAWS).to(like)).unbind(0), spreads(1, like)[0].clone()
+    usual[[*HIPS, *KNEES]] = LEGS
     poses = [_posed(angles, like) for angles in (STANDING, SEATED)]
     return [Guess(pose, usual, turn, True) for pose in poses for turn in turns]
 

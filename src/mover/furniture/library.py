@@ -183,10 +183,11 @@ NOISE = (
 
 WIDE_CLASSES: dict[str, tuple[str, ...]] = {
     "dining table": ("table", "coffee table", "desk"),
+    "table": ("table", "coffee table", "desk"),
     "couch": ("sofa", "armchair"),
     "chair": ("chair", "armchair", "office chair", "stool"),
 }
-"""What detectors have one name for (COCO's), the likeliest first."""
+"""What detectors and data sets have one name for, the likeliest first."""
 
 SEATS = frozenset(
     {"chair", "armchair", "office chair", "sofa", "stool", "bar stool", "bench", "bed"}
