@@ -172,6 +172,21 @@ def test_a_known_height_scales_the_person_about_the_camera():
     assert "height not used" in found.warnings[0]
 
 
+def test_a_height_is_compared_with_the_shape_of_who_never_stands():
+    model, seated = open_body(), pose({"left_hip": (-80, 0, 0), "right_hip": (-80, 0, 0)}, 4)
+    seated = dataclasses.replace(seated, transl=torch.tensor([[0.1, 0.2, 3.0]]).repeat(4, 1))
+    verts, joints = model.posed(seated)
+    bodies = dataclasses.replace(
+        film(spots(4)), verts=verts, joints=joints, joint_names=model.joint_names, pose=seated
+    )
+    tall = float(model.verts[:, 1].max() - model.verts[:, 1].min())
+    for height, size in ((tall, 1.0), (1.05 * tall, 1.05)):
+        seen = dataclasses.replace(masks_of(bodies), heights={"0": height})
+        found = find_depth(inputs_of(bodies, seen), QUICK)
+        assert float(found.size[0]) == pytest.approx(size, abs=1e-5)
+        assert any("is scaled to" in text for text in found.warnings) == (size != 1)
+
+
 def test_pose_and_mesh_move_together():
     model, base = open_body(), pose(STRIDE, 4)
     base = dataclasses.replace(base, transl=torch.tensor([[0.1, 0.2, 3.0]]).repeat(4, 1))

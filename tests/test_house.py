@@ -16,28 +16,28 @@ import pytest
 HOME = Path(__file__).parents[1]
 LINES = {
     "src/mover/app": 4_366,
-    "src/mover/bodies": 2_058,
+    "src/mover/bodies": 2_070,
     "src/mover/core": 1_613,
     "src/mover/energy": 3_820,
     "src/mover/evaluate": 1_094,
     "src/mover/extensions": 1_235,
-    "src/mover/fitting": 2_142,
-    "src/mover/furniture": 961,
-    "src/mover/geometry": 3_494,
+    "src/mover/fitting": 2_145,
+    "src/mover/furniture": 959,
+    "src/mover/geometry": 3_491,
     "src/mover/io": 10_579,
     "src/mover/perceive": 2_847,
     "src/mover/pipeline": 1_227,
-    "src/mover/stages": 6_115,
+    "src/mover/stages": 6_118,
     "bench": 7_562,
     "benchmarks": 1_119,
-    "tests": 30_154,
+    "tests": 30_179,
 }
 FILES = {"src/mover": 238, "bench": 41}
 LIMITS = {
     "words in code": 0,
     "words in pages": 0,
     "class names with two meanings": 0,
-    "small helpers": 78,
+    "small helpers": 77,
     "modules in circles": 0,
 }  # fmt: skip
 WORDS = {

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mover.bodies import BodyModel, load_model, run_model
 from mover.bodies.skeleton import BODY
-from mover.bodies.skinning import SkinnedBody, growth_of, shaped, vertex_subset
+from mover.bodies.skinning import SkinnedBody, growth_of, heights_of, shaped, vertex_subset
 from mover.core.errors import InputError
 from mover.core.records import map_tensors, record
 from mover.core.types import Bodies, BodyPose, Camera
@@ -147,13 +147,7 @@ def larger(bodies: Bodies, factor: Float[Tensor, " bodies"]) -> Bodies:
     joints = None if bodies.joints is None else wide * bodies.joints
     meshes = dataclasses.replace(bodies, verts=wide * bodies.verts, joints=joints, pose=None)
     pose = bodies.pose
-    if pose is None or not pose.betas.shape[1]:
-        return meshes
-    try:
-        model = load_model(pose.model, pose.gender)
-    except InputError:
-        return meshes
-    if not isinstance(model, SkinnedBody):
+    if pose is None or not pose.betas.shape[1] or (model := _skinned(pose)) is None:
         return meshes
     betas, wide = pose.betas, factor.to(pose.betas)[:, None]
     growth = growth_of(model)[: betas.shape[1]].to(betas)
@@ -162,6 +156,24 @@ def larger(bodies: Bodies, factor: Float[Tensor, " bodies"]) -> Bodies:
     pose = dataclasses.replace(pose, betas=grown, transl=wide * (pose.transl + before) - after)
     taller = dataclasses.replace(bodies, pose=pose)
     return corrected(taller, no_correction(taller))
+
+
+def _skinned(pose: BodyPose) -> SkinnedBody | None:
+    """The model of the parameters, where it is there and has shapes."""
+    try:
+        model = load_model(pose.model, pose.gender)
+    except InputError:
+        return None
+    return model if isinstance(model, SkinnedBody) else None
+
+
+def statures(pose: BodyPose) -> Float[Tensor, " bodies"] | None:
+    """How tall bodies are upright [m]; None where their model is not there."""
+    if (model := _skinned(pose)) is None:
+        return None
+    usual, dirs = heights_of(model)
+    count = min(pose.betas.shape[1], len(dirs))
+    return usual + pose.betas[:, :count] @ dirs[:count].to(pose.betas)
 
 
 def spread(verts: Float[Tensor, "verts 3"], count: int) -> Int[Tensor, " picked"]:

@@ -48,9 +48,7 @@ STANDING = {"hip": (0, -10.0), "knee": (0, 15.0), "elbow": (1, -25.0)}
 the mean of a gait cycle (hips 10, knees 20; Perry, Burnfield: Gait Analysis, 2010)."""
 SEATED = {"hip": (0, -80.0), "knee": (0, 85.0)}
 """Of a seated person."""
-LEGS = math.radians(18)
-"""By which hips and knees bend differently, as over a gait cycle. With the spread of all postures
-legs bend where their keypoints are closer together than the model's, and the body comes nearer."""
+LEGS = math.radians(18)  # by which hips and knees differ from both, as over a gait cycle
 ARMS = ("shoulder",)
 """Hang by their weight where the trunk is upright; those of lying people may be anywhere."""
 TORSO = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")

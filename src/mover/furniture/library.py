@@ -197,9 +197,6 @@ SEATS = frozenset(
 BACKS = frozenset({"chair", "armchair", "office chair", "sofa"})
 """Classes with something to lean against."""
 
-TOPS = frozenset({"table", "desk", "coffee table", "cabinet", "nightstand", "shelf", "bed"})
-"""Classes whose top carries a hand."""
-
 WALL_PIECES = frozenset({"sofa", "bed", "desk", "shelf", "cabinet", "wardrobe", "nightstand"})
 """Classes that usually stand with their back to a wall."""
 

@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mover.bodies.corrected import has_mean_shape, larger
+from mover.bodies.corrected import has_mean_shape, larger, statures
 from mover.bodies.parts import BodyParts
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
@@ -101,6 +101,7 @@ def _unknown(why: str) -> Peak:
     return Peak(1.0, float("inf"), FULL, (f"{why}, it stays as given",))
 
 
+RIGHT = 0.003  # a body whose size is off by less has the known height
 LIKELY_SIZE = (0.8, 1.25)  # a body whose size is off by more is a mistake in the height
 
 
@@ -230,21 +231,23 @@ def _with_heights(peak: Peak, found: Extents | None, config: DepthConfig) -> Pea
 
 
 def _size(inputs: DepthInputs, rows: Int[Tensor, " rows"], person: str) -> tuple[float, list[str]]:
-    """Known height over that of the upright body."""
-    known = inputs.people.heights.get(person)
+    """Known height over that of the body's shape, or of a mesh where it stands upright."""
+    bodies, known = inputs.bodies, inputs.people.heights.get(person)
     if known is None:
         return 1.0, []
-    up = inputs.camera.R_cam_world[:, 1].to(inputs.bodies.verts)
-    straight = straight_legs(inputs.bodies, inputs.parts, up).all(1)
-    standing = rows[straight[rows]]
-    if not len(standing):
+    heights = None if bodies.pose is None else statures(bodies.pose)
+    if heights is None:
+        up = inputs.camera.R_cam_world[:, 1].to(bodies.verts)
+        rows = rows[straight_legs(bodies, inputs.parts, up).all(1)[rows]]
+        heights = (bodies.verts @ up).amax(1) - (bodies.verts @ up).amin(1)
+    if not len(rows):
         return 1.0, [f"person {person} never stands straight: the known height is not used"]
-    height = inputs.bodies.verts[standing] @ up
-    tall = float((height.amax(1) - height.amin(1)).quantile(0.9))
+    tall = float(heights[rows].quantile(0.9))
     size = known / tall
     if not LIKELY_SIZE[0] < size < LIKELY_SIZE[1]:
         return 1.0, [f"person {person} is {tall:.2f} m tall, not {known:.2f} m: height not used"]
-    return size, [f"person {person} is {tall:.2f} m tall and is scaled to {known:.2f} m"]
+    note = f"person {person} is {tall:.2f} m tall and is scaled to {known:.2f} m"
+    return size, [note] if abs(size - 1) > RIGHT else []
 
 
 def _curves(
