@@ -1,5 +1,7 @@
 """The same masks in every layout, and parts of captures that come one after the other."""
 
+import base64
+import io
 import json
 from pathlib import Path
 from typing import Any
@@ -88,6 +90,27 @@ def test_shapes_of_labelme_are_filled_and_those_of_a_group_are_one(tmp_path):
     truth[0, 10:25, 10:30] = truth[0, 10:14, 40:44] = True
     truth[1, 30:40, 45:50] = truth[2, 30:34, 0:8] = True
     assert (np.stack([drawn_of(item) for item in found.items]) == truth).all()
+    file = tmp_path / "tools.json"  # its AI tools save pixels, and round tables are circles
+    layouts.write_labelme(file, [
+        ("table", [[30, 20], [30, 35]], "circle", None),
+        ("chair", [[60.0, 40.0], [65.0, 44.0]], "mask", 1),
+        ("chair", [[0, 30], [8, 30], [8, 34], [0, 34]], "polygon", 1),
+    ])  # fmt: skip
+    tree, pixels = json.loads(file.read_text()), np.eye(5, 6, dtype=np.uint8)
+    with io.BytesIO() as png:
+        Image.fromarray(255 * pixels).save(png, "PNG")
+        tree["shapes"][1]["mask"] = base64.b64encode(png.getvalue()).decode()
+    file.write_text(json.dumps(tree))
+    round_table, chair = (drawn_of(item) for item in read_instances(file, {}, None).items)
+    y, x = np.mgrid[:48, :64] + 0.5
+    assert (round_table ^ (np.hypot(x - 30, y - 20) < 15)).sum() < 12  # a polygon of 64 corners
+    truth[1:] = False
+    truth[1, 30:34, 0:8], truth[1, 40:45, 60:64] = True, pixels[:, :4] > 0
+    assert (chair == truth[1]).all()
+    tree["shapes"][1]["mask"] = "no png"
+    file.write_text(json.dumps(tree))
+    with pytest.raises(InputError, match=r"shapes\[1\]\.mask.* a PNG in base64"):
+        read_instances(file, {}, None)
     bad = layouts.write_labelme(tmp_path / "b.json", [("chair", [[1, 1], [9, 9]], "line", None)])
     with pytest.raises(InputError, match=r"shapes\[0\]\.shape_type.*polygon, rectangle"):
         read_instances(bad, {}, None)
