@@ -16,7 +16,7 @@ from mover.core.records import rows_of
 from mover.core.run import Run
 from mover.core.types import Camera, Detection, Masks, Scene, SceneObject
 from mover.energy.image_terms import SEEN
-from mover.furniture.library import make_piece
+from mover.furniture.library import choose_piece, make_piece
 from mover.geometry.boxes import box_of, iou3d
 from mover.geometry.camera import pitch_roll, tilted, to_camera, to_world
 from mover.geometry.placement import place_object
@@ -110,6 +110,20 @@ QUICK = LayoutConfig(shapes=4, keep=2, turns=4)
 @pytest.fixture(scope="module")
 def pieces() -> list[SceneObject]:
     return furniture(ROOM)
+
+
+def test_furniture_along_walls_faces_the_room(tmp_path: Path):
+    """A block has the same outline from behind, and nobody puts a cabinet back to front."""
+    block = choose_piece("box", (0.9, 0.9, 0.45))
+    (tmp_path / "own").mkdir()
+    write_mesh(block, tmp_path / "own" / "cabinet_0.glb")
+    places = {"cabinet": (-1.2, -4.0, 0.4), "wardrobe": (1.0, -4.5, 2.5)}
+    shown = [replace(p, category="cabinet", mesh=block) for p in furniture(places)]
+    found = first_scene(picture(shown, camera()), QUICK, Run(tmp_path / "run"), tmp_path / "own")
+    for piece, true in zip(found.scene.objects, shown, strict=True):
+        front = torch.stack([piece.yaw.sin(), piece.yaw.cos()])
+        assert front @ -piece.t_world_object[[0, 2]] > 0
+        assert abs((2 * (piece.yaw - true.yaw)).sin()) < 0.2
 
 
 def test_outermost_points_have_the_box_of_the_shape(pieces: list[SceneObject]):

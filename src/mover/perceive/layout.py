@@ -10,6 +10,7 @@ Everything stands on the ground. What is best becomes the scene; the next best s
 each thing are kept beside it.
 """
 
+import math
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,10 +24,12 @@ from mover.core.errors import InputError
 from mover.core.records import record, rows_of
 from mover.core.run import Run
 from mover.core.types import Camera, Detection, Heading, Layout, Mesh, Scene, SceneObject
+from mover.energy.config import SceneConfig
+from mover.energy.fused.energy import energy_function
 from mover.energy.human_terms import DepthRange
 from mover.energy.objective import HumanCues, ImageCues
 from mover.energy.prior_terms import Given
-from mover.furniture.library import canonical, catalogue, choose_piece, meanings
+from mover.furniture.library import WALL_PIECES, canonical, catalogue, choose_piece, meanings
 from mover.geometry.camera import to_world
 from mover.geometry.crops import sample_nearest
 from mover.geometry.mesh import box, used
@@ -43,6 +46,7 @@ from mover.stages.objects.own_edges import own_edges
 from mover.stages.objects.place_inputs import PlaceInputs
 from mover.stages.objects.place_objects import place_objects
 from mover.stages.objects.prepare_objects import PrepareInputs, prepare_objects, to_objects
+from mover.stages.objects.starts import facing
 from mover.stages.posterior import Gaussian
 
 OTHER_SIZES: dict[str, tuple[float, float, float]] = {
@@ -66,6 +70,7 @@ MOST_OFF = 1.5  # factor of a network's depth; what is farther off is no floor
 SOUGHT = 0.04
 """Error of the scale of a first scene (rooms 100 to 104), as a logarithm."""
 TURNED_APART = 0.6  # [rad], turns that are nearer count as one start
+SAME = 1.05, 0.002  # times the energy, and beside it: an outline that is the same from behind
 LEVEL = 0.92  # cosine of the largest tilt of a surface that counts as floor
 CELL = 0.04  # [m], height of a slice in which floor is counted
 ENOUGH = 0.25  # of the fullest slice: the lowest slice with so much is the floor
@@ -244,11 +249,25 @@ def first_scene(
         starts.yaw[0],
     )  # fmt: skip
     found = run.stage(place_objects, inputs, config.place)
-    objects = to_objects(pieces, prepared, found.layout)
+    layout = _turned_to_camera(found.layout, inputs, config)
+    objects = to_objects(pieces, prepared, layout)
     others = _ranked(picture, objects, things, found.energy[0])
     scene_objects = tuple(group[0].piece for group in others)
     scene = Scene(camera, -screened.height, scene_objects, size_spread=SOUGHT)
     return FirstScene(scene, others, skipped)
+
+
+def _turned_to_camera(layout: Layout, inputs: PlaceInputs, config: LayoutConfig) -> Layout:
+    """Furniture along walls with its front to the room, where its outline is the same."""
+    objects, place = inputs.objects, config.place
+    other = replace(layout, yaw=wrap(layout.yaw + math.pi))
+    terms = SceneConfig(place.weights, place.form, place.uniform_scale_weight)
+    energy = energy_function(objects, inputs.camera, inputs.image, inputs.humans, terms)
+    now, then = energy(Layout.cat(layout[None], other[None])).per_item.detach()
+    along = torch.tensor([canonical(name) in WALL_PIECES for name in objects.categories])
+    away = facing(layout, torch.zeros(1, 3)) < 0
+    turn = along & away & (then <= SAME[0] * now + SAME[1])
+    return replace(layout, yaw=torch.where(turn, other.yaw, layout.yaw))
 
 
 def _pieces(picture: Picture, chosen: list[tuple[int, ShapeChoice]]) -> tuple[SceneObject, ...]:
