@@ -264,7 +264,7 @@ def _turned_to_camera(layout: Layout, inputs: PlaceInputs, config: LayoutConfig)
     terms = SceneConfig(place.weights, place.form, place.uniform_scale_weight)
     energy = energy_function(objects, inputs.camera, inputs.image, inputs.humans, terms)
     now, then = energy(Layout.cat(layout[None], other[None])).per_item.detach()
-    along = torch.tensor([canonical(name) in WALL_PIECES for name in objects.categories])
+    along = torch.tensor([name in WALL_PIECES for name in objects.categories])
     away = facing(layout, torch.zeros(1, 3)) < 0
     turn = along & away & (then <= SAME[0] * now + SAME[1])
     return replace(layout, yaw=torch.where(turn, other.yaw, layout.yaw))

@@ -1,36 +1,22 @@
 """Files of masks: COCO, lists of detections, labelme and others (JSON); pixels: label_images.py."""
 
-import base64
 import dataclasses
-import io
-import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from msgspec import Struct, field
 
 from mover.core.errors import InputError
-from mover.core.types import Masks
-from mover.geometry.rle import decode
 from mover.io.capture.parts import UNKNOWN, Hints, Parts
 from mover.io.files.fields import LAST_INDEX, At, read_json
 from mover.io.files.images import image_size
 from mover.io.files.schema import Id, Index, Share, Side, Text, checked
 from mover.io.masks.coco import COCO_CLASSES, COCO_IDS, MOST_THINGS, CategoryFields, is_drawn
-from mover.io.masks.instances import (
-    Instance,
-    Instances,
-    Names,
-    Size,
-    code_in,
-    code_of,
-    frames_of,
-    mask_code,
-)
+from mover.io.masks.instances import Instance, Instances, Names, Size, code_in, frames_of, mask_code
 from mover.io.masks.label_images import PICTURES, pictures_in, read_label_images, read_mask_arrays
+from mover.io.masks.labelme import labelme_instances
 from mover.io.people.values import PICKLES, natural, number_in
 
 LEAST_SCORE = 0.3  # of MMDetection, which writes everything that it thought of
@@ -442,75 +428,3 @@ def _of_mmdet(at: At, names: Names, size: Size | None) -> Instances:
         found.append(Instance(table[str(key)], box, code_in(given, size), score))
     note = f"{at.file}: {few} of {len(keys)} detections with scores below {LEAST_SCORE} left out"
     return Instances(tuple(found), size, at.file, notes=(note,) if few else ())
-
-
-class LabelmeFields(Struct, frozen=True, rename="camel"):
-    """A file of labelme: one picture."""
-
-    image_width: Side
-    image_height: Side
-    shapes: list[Any]
-
-
-class ShapeFields(Struct, frozen=True):
-    """One of its shapes."""
-
-    label: Text
-    points: list[tuple[float, float]]
-    shape_type: str = "polygon"
-    group_id: int | None = None
-    mask: str | None = None
-
-
-def labelme_instances(at: At) -> Instances:
-    """Labelme's areas; shapes of one label and `group_id` are one object."""
-    tree = checked(at, LabelmeFields)
-    size = tree.image_width, tree.image_height
-    groups: dict[tuple[str, int | None], list[bytes]] = {}
-    for index, item in enumerate(at.get("shapes").items()):
-        shape = checked(item, ShapeFields)
-        kind = item.get("shape_type").choice(("polygon", "rectangle", "circle", "mask"))
-        key = str(shape.label), -1 - index if shape.group_id is None else shape.group_id
-        if kind == "mask":
-            code = _pasted(item, shape, size)
-        else:
-            outline = [[v for point in _outline(kind, shape.points) for v in point]]
-            code = code_in(dataclasses.replace(item.get("points"), value=outline), size)
-        groups.setdefault(key, []).extend([code] if code else [])
-    found: list[Instance] = []
-    for (label, _), codes in groups.items():
-        masks = Masks(size[1], size[0], tuple(codes))
-        whole = [decode(masks, k).numpy() for k in range(len(codes))] if len(codes) > 1 else []
-        code = code_of(np.any(whole, 0)) if whole else next(iter(codes), None)
-        found.append(Instance(label, None, code))
-    return Instances(tuple(found), size, at.file)
-
-
-def _outline(kind: str, points: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """The corners of a polygon, of a rectangle by two, or of a circle by middle and border."""
-    if kind == "polygon" or len(points) != 2:
-        return points
-    (x0, y0), (x1, y1) = points
-    if kind == "rectangle":
-        return [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
-    wide, turns = math.hypot(x1 - x0, y1 - y0), (math.tau * k / 64 for k in range(64))
-    return [(x0 + wide * math.cos(turn), y0 + wide * math.sin(turn)) for turn in turns]
-
-
-def _pasted(item: At, shape: ShapeFields, size: Size) -> bytes | None:
-    """The mask of labelme's AI tools: a PNG in base64, whose first pixel lies at `points[0]`."""
-    from PIL import Image
-
-    try:
-        with Image.open(io.BytesIO(base64.b64decode(shape.mask or "", validate=True))) as picture:
-            if picture.width > size[0] or picture.height > size[1]:
-                item.get("mask").refuse("a mask no larger than the image", f"{picture.size}")
-            pixels = np.asarray(picture.convert("L")) > 0
-    except (OSError, ValueError, SyntaxError):
-        item.get("mask").refuse("a PNG in base64", "what cannot be read")
-    x, y = (round(v) for v in (shape.points or [(0.0, 0.0)])[0])
-    whole = np.zeros((size[1] + pixels.shape[0], size[0] + pixels.shape[1]), dtype=bool)
-    if not (0 <= x < size[0] and 0 <= y < size[1]):
-        item.get("points").refuse("a corner in the image")
-    whole[y : y + pixels.shape[0], x : x + pixels.shape[1]] = pixels
-    return code_of(whole[: size[1], : size[0]])

@@ -235,14 +235,17 @@ def _size(inputs: DepthInputs, rows: Int[Tensor, " rows"], person: str) -> tuple
     bodies, known = inputs.bodies, inputs.people.heights.get(person)
     if known is None:
         return 1.0, []
-    heights = None if bodies.pose is None else statures(bodies.pose)
-    if heights is None:
+    of_shapes = None if bodies.pose is None else statures(bodies.pose)
+    if of_shapes is not None:
+        heights = of_shapes[rows]
+    else:
         up = inputs.camera.R_cam_world[:, 1].to(bodies.verts)
         rows = rows[straight_legs(bodies, inputs.parts, up).all(1)[rows]]
-        heights = (bodies.verts @ up).amax(1) - (bodies.verts @ up).amin(1)
+        along = bodies.verts[rows] @ up
+        heights = along.amax(1) - along.amin(1)
     if not len(rows):
         return 1.0, [f"person {person} never stands straight: the known height is not used"]
-    tall = float(heights[rows].quantile(0.9))
+    tall = float(heights.quantile(0.9))
     size = known / tall
     if not LIKELY_SIZE[0] < size < LIKELY_SIZE[1]:
         return 1.0, [f"person {person} is {tall:.2f} m tall, not {known:.2f} m: height not used"]
