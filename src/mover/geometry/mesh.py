@@ -250,12 +250,13 @@ def coarser(
 ) -> tuple[Float[Tensor, "meshes fewer 3"], Int[Tensor, "triangles 3"]]:
     """Meshes of one topology with about `count` triangles, all simplified as the first one is.
 
-    Each of the new vertices is an old one. Meshes of fewer triangles, and those that would not be
-    closed any more, stay as they are.
+    Each of the new vertices is an old one. Where the result would not be closed, more triangles
+    are kept: up to twice as many, else all, as in meshes of fewer triangles.
     """
     if len(meshes) == 0 or len(faces) <= count:
         return meshes, faces
-    found = chosen_vertices(meshes[0], faces, count)
-    if found is None or not is_closed(found[1]):
-        return meshes, faces
-    return meshes[:, found[0].to(meshes.device)].contiguous(), found[1]
+    for some in (count, 4 * count // 3, 2 * count):
+        found = chosen_vertices(meshes[0], faces, some)
+        if found is not None and is_closed(found[1]):
+            return meshes[:, found[0].to(meshes.device)].contiguous(), found[1]
+    return meshes, faces

@@ -30,6 +30,7 @@ from mover.geometry.warp_start import array, filled, kernels, launch, name_of, s
 SHELL = 2.0  # [cells], up to where it is exact outside: more than a cell's diagonal
 BAND = 4.0  # [cells], what stands for any larger distance
 BRICK = 8  # [cells]
+NEAR = 0.03  # [m], edge of the cubes in which one position stands for its neighbours
 
 
 @record
@@ -149,9 +150,24 @@ def signed_distance(
     distance = np.sqrt(closest(query, corners, triangles)[0])
     within = ((query > corners.min(0)) & (query < corners.max(0))).all(-1)
     if within.any():  # outside of the box nothing is inside
-        deep = enclosed(query[within], corners, triangles)
+        deep = _enclosed(query[within], distance[within], corners, triangles)
         distance[within] *= np.where(deep, -1, 1)
     return torch.from_numpy(distance).to(points)
+
+
+def _enclosed(
+    query: np.ndarray, distance: np.ndarray, verts: np.ndarray, faces: np.ndarray
+) -> np.ndarray:
+    """As `enclosed`: no surface lies between two positions that are nearer together than it."""
+    cell = ((query - query.min(0)) / NEAR).astype(np.int64)
+    row = np.ravel_multi_index(tuple(cell.T), tuple(cell.max(0) + 1))
+    _, first, group = np.unique(row, return_index=True, return_inverse=True)
+    one = first[group]  # stands for its neighbours
+    alone = np.linalg.norm(query - query[one], axis=1) >= np.maximum(distance, distance[one])
+    alone[first] = True
+    found = np.zeros(len(query), dtype=bool)
+    found[alone] = enclosed(query[alone], verts, faces)
+    return np.where(alone, found, found[one])
 
 
 def outward(verts: np.ndarray, faces: np.ndarray) -> np.ndarray:

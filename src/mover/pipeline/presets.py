@@ -156,7 +156,7 @@ ROBUST = Config(
     ),
     refine=RefineConfig(rounds=2),
     sizes=SpreadConfig(0.05),
-    gather=GatherConfig(erode=1, reach=0.1),
+    gather=GatherConfig(erode=1, reach=0.1, cells=128),
     assign=_GROUPS,
     place=PlaceConfig(
         _ROBUST_FULL, "robust", BatchedBFGS(), wall_alignment_steps=2,

@@ -122,32 +122,41 @@ def surround(b: Body) -> None:
     if area <= SLIVER * wp.length(q - p) * wp.length(r - p):
         return
     normal = normal / area
+    pq = wp.cross(normal, q - p)
+    qr = wp.cross(normal, r - q)
+    rp = wp.cross(normal, p - r)
     low = wp.min(p, wp.min(q, r))
     high = wp.max(p, wp.max(q, r))
     xl = wp.max(int(wp.ceil(low[0] - SHELL)), 0)
-    yl = wp.max(int(wp.ceil(low[1] - SHELL)), 0)
     zl = wp.max(int(wp.ceil(low[2] - SHELL)), 0)
     xh = wp.min(int(wp.floor(high[0] + SHELL)), b.size[0] - 1)
-    yh = wp.min(int(wp.floor(high[1] + SHELL)), b.size[1] - 1)
     zh = wp.min(int(wp.floor(high[2] + SHELL)), b.size[2] - 1)
     for x in range(xl, xh + 1):
+        dx = wp.max(wp.max(low[0] - float(x), float(x) - high[0]), 0.0)
         for z in range(zl, zh + 1):
+            dz = wp.max(wp.max(low[2] - float(z), float(z) - high[2]), 0.0)
+            up = wp.sqrt(wp.max(SHELL * SHELL - dx * dx - dz * dz, 0.0)) + MORE
+            yl = wp.max(int(wp.ceil(low[1] - up)), 0)
+            yh = wp.min(int(wp.floor(high[1] + up)), b.size[1] - 1)
             for y in range(yl, yh + 1):
                 at = wp.vec3(float(x), float(y), float(z))
                 height = wp.abs(wp.dot(at - p, normal))
-                held = b.near[x, z, y]
-                if height < wp.min(held, SHELL):
-                    u = wp.dot(wp.cross(q - p, at - p), normal)
-                    v = wp.dot(wp.cross(r - q, at - q), normal)
-                    w = wp.dot(wp.cross(p - r, at - r), normal)
-                    distance = height
-                    if wp.min(u, wp.min(v, w)) < 0.0:
-                        edge = wp.min(
-                            wp.length_sq(toward(at, p, q)),
-                            wp.min(wp.length_sq(toward(at, q, r)), wp.length_sq(toward(at, r, p))),
-                        )
-                        distance = wp.sqrt(edge)
-                    wp.atomic_min(b.near, x, z, y, distance)
+                held = wp.min(b.near[x, z, y], SHELL)
+                if height < held:
+                    least = height * height  # above the triangle
+                    u = wp.dot(at - p, pq)
+                    v = wp.dot(at - q, qr)
+                    w = wp.dot(at - r, rp)
+                    if wp.min(u, wp.min(v, w)) < 0.0:  # nearest is an edge beyond which it is
+                        least = FAR * FAR
+                        if u < 0.0:
+                            least = wp.length_sq(toward(at, p, q))
+                        if v < 0.0:
+                            least = wp.min(least, wp.length_sq(toward(at, q, r)))
+                        if w < 0.0:
+                            least = wp.min(least, wp.length_sq(toward(at, r, p)))
+                    if least < held * held:
+                        wp.atomic_min(b.near, x, z, y, wp.sqrt(least))
 
 
 @wp.kernel
@@ -164,9 +173,9 @@ def lower(
     for y in range(b.size[1]):
         winding += b.winding[x, z, y] * side
         at = b.low + wp.vec3i(x, y, z)
-        held = field[at[0], at[1], at[2]]
         near = b.near[x, z, y]
         if winding > 0:
+            held = field[at[0], at[1], at[2]]
             reach = wp.min(near, reach + 1.0 + MORE)
             if near > SHELL and reach > -held / cell:
                 p = wp.vec3(float(x), float(y), float(z))
@@ -177,4 +186,5 @@ def lower(
         else:
             reach = FAR
             if near <= SHELL:
+                held = field[at[0], at[1], at[2]]
                 field[at[0], at[1], at[2]] = wp.min(held, near * cell)
