@@ -21,6 +21,7 @@ from mover.core.records import record
 from mover.core.types import Layout, Objects
 from mover.energy.config import Variant
 from mover.energy.minimize import geman_mcclure, safe_norm
+from mover.geometry.crops import depth_in
 from mover.geometry.raster import Depths
 from mover.geometry.rotations import rot_y
 from mover.geometry.volume import Volume, sample
@@ -128,12 +129,10 @@ def _short(
 
 def _thick(hidden: Bool[Tensor, "h w"], reach: float) -> Bool[Tensor, "h w"]:
     """What a wrong outline does not explain: discs of the radius `reach` that are wholly hidden."""
-    from scipy.ndimage import distance_transform_edt
-
-    inner = torch.from_numpy(distance_transform_edt(hidden.cpu().numpy())) > reach
-    if bool(inner.any()):
-        inner = torch.from_numpy(distance_transform_edt(~inner.numpy())) < reach / 2
-    return hidden & inner.to(hidden.device)
+    inner = depth_in(hidden.cpu().numpy()) > reach
+    if inner.any():
+        inner = depth_in(~inner) < reach / 2
+    return hidden & torch.from_numpy(inner).to(hidden.device)
 
 
 def eroded(mask: Bool[Tensor, "*batch h w"], steps: int) -> Bool[Tensor, "*batch h w"]:

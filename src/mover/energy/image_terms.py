@@ -20,6 +20,7 @@ from torch import Tensor
 from mover.core.devices import constant
 from mover.core.records import record
 from mover.energy.config import Variant
+from mover.geometry.crops import depth_in
 from mover.geometry.raster import Depths
 
 # --- Boxes -------------------------------------------------------------------------------------
@@ -131,14 +132,12 @@ def borders_of(
 
     `zoom` is the number of pixels of the window for one of the image.
     """
-    from scipy.ndimage import distance_transform_edt
 
     def inside(mask: Tensor) -> Tensor:
         within = (mask > 0.5).cpu().numpy()
         if not within.any():
             return torch.full_like(mask, -torch.inf)
-        near, beyond = (distance_transform_edt(x) for x in (within, ~within))
-        far = (torch.as_tensor(near) - torch.as_tensor(beyond)).to(mask)
+        far = torch.as_tensor(depth_in(within) - depth_in(~within)).to(mask)
         return torch.where(far.abs() < 1.5, mask - 0.5, far - 0.5 * far.sign())
 
     depth = torch.stack([inside(m) for m in masks]) if len(masks) else masks

@@ -1,5 +1,6 @@
-"""Square windows of an image, and exact means of image areas in them."""
+"""Square windows of an image, exact means of image areas in them, distances in masks."""
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -69,3 +70,10 @@ def sample_nearest(
         rows.clamp(0, height - 1).unsqueeze(-1), columns.clamp(0, width - 1).unsqueeze(-2)
     ]
     return torch.where(inside, picked, torch.full_like(picked, outside))
+
+
+def depth_in(mask: np.ndarray) -> np.ndarray:
+    """Distance of each pixel of a mask from the nearest one outside of it; 0 there [px]."""
+    import cv2
+
+    return cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mover.core.records import record
+from mover.geometry.crops import depth_in
 from mover.geometry.nearest import as_float64, as_int64
 from mover.geometry.volume import Volume, outward, sample, winding
 
@@ -79,8 +80,4 @@ def _outlines(inside: np.ndarray, cell: float) -> np.ndarray:
 
 def _outline(section: np.ndarray) -> np.ndarray:
     """Signed distance to the border between cells [cells]."""
-    from scipy.ndimage import distance_transform_edt
-
-    outside = np.asarray(distance_transform_edt(~section)).clip(max=1.5)
-    depth = np.asarray(distance_transform_edt(section))
-    return np.where(section, 0.5 - depth, outside - 0.5)
+    return np.where(section, 0.5 - depth_in(section), depth_in(~section).clip(max=1.5) - 0.5)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from mover.core.records import fingerprint, record
 from mover.core.types import Detection, Masks, People
+from mover.geometry.crops import depth_in
 from mover.geometry.rle import decode, encode, tight_box
 from mover.perceive.networks import Finds, overlap, stack_of
 from mover.perceive.steady import Drift, shown_by
@@ -86,9 +87,7 @@ def grown(mask: NDArray[np.bool_], steps: int) -> NDArray[np.bool_]:
     """A mask with a margin [px]."""
     if steps < 1 or not mask.any():
         return mask
-    from scipy.ndimage import distance_transform_edt
-
-    return np.asarray(distance_transform_edt(~mask)) <= steps
+    return depth_in(~mask) <= steps
 
 
 def clip_of_clean(clean: Clean, folder: Path) -> Clip:

@@ -8,11 +8,12 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import interpolate, max_pool2d
+from torch.nn.functional import interpolate
 
 from mover.core.types import Bodies, Camera, Masks, People
 from mover.energy.image_terms import WIDTH
 from mover.geometry.camera import project
+from mover.geometry.crops import depth_in
 from mover.geometry.raster import Crops, fronts
 from mover.geometry.rle import decode, thinned
 from mover.geometry.warp_start import mapped
@@ -143,15 +144,13 @@ def _extent(mask: Bool[Tensor, "h w"]) -> tuple[float, float]:
 
 def _thick(mask: Bool[Tensor, "h w"]) -> float:
     """Width of the head [px]: of the largest disc in the top of what is set."""
-    from scipy.ndimage import distance_transform_edt
-
     rows = torch.nonzero(mask.any(1))[:, 0]
     if not len(rows):
         return 0.0
     high = int(rows[-1] - rows[0]) + 1
     top = mask[rows[0] : rows[0] + max(3, round(HEAD * high))]
     padded = torch.nn.functional.pad(top, [1, 1, 1, 0])
-    return 2 * float(np.max(np.asarray(distance_transform_edt(padded.numpy())))) - 1
+    return 2 * float(depth_in(padded.numpy()).max()) - 1
 
 
 # How well drawn bodies fill a mask whose border may be too wide or too narrow everywhere.
@@ -217,10 +216,13 @@ def enlarged(mask: Bool[Tensor, "h w"], times: int) -> Bool[Tensor, "big_h big_w
 
 def widened(masks: Bool[Tensor, "masks h w"], wide: int) -> Bool[Tensor, "masks h w"]:
     """Masks that reach so many pixels farther along both axes."""
-    if not wide:
+    if not wide or not len(masks):
         return masks
-    rows = max_pool2d(masks.float(), (2 * wide + 1, 1), 1, (wide, 0))
-    return max_pool2d(rows, (1, 2 * wide + 1), 1, (0, wide)) > 0
+    import cv2
+
+    square, pixels = np.ones((2 * wide + 1, 2 * wide + 1), np.uint8), masks.cpu().numpy()
+    grown = [cv2.dilate(one.astype(np.uint8), square) > 0 for one in pixels]
+    return torch.from_numpy(np.stack(grown)).to(masks.device)
 
 
 # The image at the width at which the paper's weights have their meaning.

@@ -110,6 +110,14 @@ def toward(p: wp.vec3, a: wp.vec3, b: wp.vec3) -> wp.vec3:
     return a + wp.clamp(share, 0.0, 1.0) * edge - p
 
 
+@wp.func
+def beside(at: wp.vec3, a: wp.vec3, b: wp.vec3, inward: float, least: float) -> float:
+    """The lesser squared distance: that to an edge counts where the place is beyond it."""
+    if inward < 0.0:
+        least = wp.min(least, wp.length_sq(toward(at, a, b)))
+    return least
+
+
 @wp.kernel
 def surround(b: Body) -> None:
     """Distances to a triangle from all places within the shell about it."""
@@ -143,18 +151,10 @@ def surround(b: Body) -> None:
                 height = wp.abs(wp.dot(at - p, normal))
                 held = wp.min(b.near[x, z, y], SHELL)
                 if height < held:
-                    least = height * height  # above the triangle
-                    u = wp.dot(at - p, pq)
-                    v = wp.dot(at - q, qr)
-                    w = wp.dot(at - r, rp)
-                    if wp.min(u, wp.min(v, w)) < 0.0:  # nearest is an edge beyond which it is
-                        least = FAR * FAR
-                        if u < 0.0:
-                            least = wp.length_sq(toward(at, p, q))
-                        if v < 0.0:
-                            least = wp.min(least, wp.length_sq(toward(at, q, r)))
-                        if w < 0.0:
-                            least = wp.min(least, wp.length_sq(toward(at, r, p)))
+                    least = beside(at, p, q, wp.dot(at - p, pq), FAR * FAR)
+                    least = beside(at, q, r, wp.dot(at - q, qr), least)
+                    least = beside(at, r, p, wp.dot(at - r, rp), least)
+                    least = wp.where(least < FAR, least, height * height)  # above the triangle
                     if least < held * held:
                         wp.atomic_min(b.near, x, z, y, wp.sqrt(least))
 

@@ -15,6 +15,7 @@ from mover.core.types import Bodies, Camera, Capture, Mesh, Room
 from mover.energy.body_contact import Surface
 from mover.energy.body_terms import OUTLINE_POINTS, Bounds, Outline, Sighting, bounds_of_skin
 from mover.geometry.camera import project, to_camera
+from mover.geometry.crops import depth_in
 from mover.geometry.mesh import sample_surface
 from mover.geometry.placement import place_object
 from mover.geometry.raster import Crops, first_hit, fronts
@@ -213,26 +214,32 @@ def resting_soles(
     return torch.stack(found, 1)
 
 
+def sure_masks(
+    table: MaskTable, camera: Camera, rows: Int[Tensor, " bodies"]
+) -> Bool[Tensor, "2 bodies h w"]:
+    """What is well inside the mask of each body, and what is well outside all masks."""
+    found: list[Tensor] = []
+    for row in rows.tolist():
+        own, others = small_masks(torch.stack(table.decode(row)), camera)
+        both = torch.stack([own, ~(own | others)])
+        found.append(~widened(~both, INNER) & (table.own[row] is not None))
+    return torch.stack(found, 1)
+
+
 def order_bounds(
     room: Surroundings,
-    table: MaskTable,
-    rows: Int[Tensor, " bodies"],
+    masks: Bool[Tensor, "2 bodies h w"],
     skin: Float[Tensor, "bodies points 3"],
     normals: Float[Tensor, "bodies points 3"],
 ) -> Bounds:
-    """Bounds of the depth of skin points where they are now, by people's masks and furniture."""
+    """Bounds of the depth of skin points where they are now, by `sure_masks` and furniture."""
     small = small_camera(room.camera)
     cam, facing = (to_camera(x, room.camera.R_cam_world) for x in (skin, normals))
     at = project(cam, small.K).floor().long()
     inside = (at >= 0).all(-1) & (at[..., 0] < small.width) & (at[..., 1] < small.height)
     x, y = at[..., 0].clamp(0, small.width - 1), at[..., 1].clamp(0, small.height - 1)
-    masks: list[Tensor] = []  # well inside the body's mask, and well outside all
-    for row in rows.tolist():
-        own, others = small_masks(torch.stack(table.decode(row)), room.camera)
-        both = torch.stack([own, ~(own | others)])
-        masks.append(~widened(~both, INNER) & (table.own[row] is not None))
-    shown, away = torch.stack(masks, 1)
-    body = torch.arange(len(rows))[:, None].expand_as(x)
+    shown, away = masks
+    body = torch.arange(len(skin))[:, None].expand_as(x)
     return bounds_of_skin(
         Sighting(
             torch.where(inside, room.front[y, x], torch.full_like(cam[..., 2], torch.inf)),
@@ -362,12 +369,9 @@ def _sampled(
 
 def _signed(mask: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     """Distance from the outline, negative inside [px]."""
-    from scipy.ndimage import distance_transform_edt
-
     inside = mask.numpy()
-    outer = np.asarray(distance_transform_edt(~inside)) if not inside.all() else 0.0 * inside
-    inner = np.asarray(distance_transform_edt(inside)) if not inside.all() else inside + 0.0
-    return torch.from_numpy(np.where(inside, 0.5 - inner, outer - 0.5)).float()
+    inner = depth_in(inside) if not inside.all() else 1.0
+    return torch.from_numpy(np.where(inside, 0.5 - inner, depth_in(~inside) - 0.5)).float()
 
 
 def _slope(image: Float[Tensor, "h w"]) -> Float[Tensor, "2 h w"]:
@@ -375,4 +379,4 @@ def _slope(image: Float[Tensor, "h w"]) -> Float[Tensor, "2 h w"]:
     smooth = torch.nn.functional.avg_pool2d(image[None], 5, 1, 2, count_include_pad=False)
     down, right = torch.gradient(smooth[0])
     both = torch.stack([right, down])
-    return both / both.norm(dim=0).clamp_min(1e-6)
+    return both / torch.hypot(right, down).clamp_min(1e-6)

@@ -55,6 +55,7 @@ from mover.stages.people.body_evidence import (
     order_bounds,
     pick,
     resting_soles,
+    sure_masks,
     surroundings_of,
 )
 from mover.stages.people.plant_feet import plant_feet
@@ -197,10 +198,11 @@ def gathered(
     bodies: Bodies,
     state: MovedBodies,
     weights: BodyWeights,
+    sure: Bool[Tensor, "2 rows h w"] | None,
 ) -> BodyEvidence:
     """Contacts, occlusion bounds and outline targets at the current poses of some rows.
 
-    `bodies` are these rows as they were given.
+    `bodies` are these rows as they were given; `sure` are their masks if the order counts.
     """
     known, puppet, room = state.known, state.puppet, scene.room
     with torch.no_grad():
@@ -213,9 +215,9 @@ def gathered(
             bent=ANGLE if puppet.model is None else 0.0,
         )  # fmt: skip
         matches = gather_matches(skin, room.surface, room.furniture)
-    if weights.order and scene.masks is not None:
+    if sure is not None:
         even = scene.picked.even
-        bounds = order_bounds(room, scene.masks, rows, now.skin[:, even], normals[:, even])
+        bounds = order_bounds(room, sure, now.skin[:, even], normals[:, even])
     if weights.outline and scene.masks is not None:
         whole = replace(bodies, pose=None) if puppet.model is None else bodies
         verts = state.in_camera(corrected(whole, state.by).verts)
@@ -343,12 +345,15 @@ def _refine(
     )  # fmt: skip
     by, left = no_correction(stiff), torch.zeros(len(rows))
     total = config.places + config.rounds
+    masks = scene.masks if config.weights.order else None
+    sure = None if masks is None else sure_masks(masks, room.camera, rows)
     for turn in range(total):
         now, method = (stiff, config.place) if turn < config.places else (puppet, config.method)
         by = _started(now, by)
         share = turn / max(1, total - 1)
         rho = RHOS[0] * (RHOS[1] / RHOS[0]) ** share
-        known = gathered(scene, rows, bodies, MovedBodies(by, now, known), config.weights)
+        moved = MovedBodies(by, now, known)
+        known = gathered(scene, rows, bodies, moved, config.weights, sure)
         state = MovedBodies(by, now, replace(known, rho=rho))
 
         def energy(by: Correction, state: MovedBodies = state) -> Energy:
