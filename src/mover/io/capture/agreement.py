@@ -82,11 +82,11 @@ def _directions() -> Float[Tensor, "directions 3"]:
 
 
 def _few_points(bodies: Bodies) -> Bodies:
-    """Some of the bodies, with the vertices that are outermost in some of the poses."""
-    count = len(bodies.frame)
-    rows = torch.linspace(0, count - 1, min(count, MOST_BODIES)).long()
-    few = rows_of(replace(bodies, pose=None), rows)
-    posed = few.verts[torch.linspace(0, len(rows) - 1, min(len(rows), POSES)).long()]
+    """All bodies of some frames, with the vertices that are outermost in some of the poses."""
+    frames, share = bodies.frame.unique(), min(1.0, MOST_BODIES / max(1, len(bodies.frame)))
+    some = frames[torch.linspace(0, len(frames) - 1, math.ceil(share * len(frames))).long()]
+    few = rows_of(replace(bodies, pose=None), torch.isin(bodies.frame, some))
+    posed = few.verts[torch.linspace(0, len(few.verts) - 1, min(len(few.verts), POSES)).long()]
     points = (posed @ _directions()[::3].mT.to(posed)).argmax(1).unique()
     return replace(few, verts=few.verts[:, points], faces=torch.zeros(0, 3, dtype=torch.long))
 
