@@ -169,7 +169,9 @@ def test_a_stack_of_frames_is_a_person_and_one_of_apart_masks_are_people(tmp_pat
     got = pixels(read_people(tmp_path / "frames.npy", {}, None))
     assert list(got) == [(k, 0) for k in range(6)]
     np.save(tmp_path / "last.npy", np.stack([walker(k) for k in range(6)])[..., None])
-    assert list(pixels(read_people(tmp_path / "last.npy", {}, None))) == [(k, 0) for k in range(6)]
+    np.save(tmp_path / "first.npy", np.stack([walker(k) for k in range(6)])[None])
+    for name in ("last.npy", "first.npy"):
+        assert list(pixels(read_people(tmp_path / name, {}, None))) == [(k, 0) for k in range(6)]
     np.save(tmp_path / "people.npy", np.stack([walker(0, k) for k in (0, 20, 40)])[:, None])
     found = read_people(tmp_path / "people.npy", {}, None)
     assert list(pixels(found)) == [(0, 0), (0, 1), (0, 2)]
@@ -188,6 +190,9 @@ def test_soft_labels_are_labels_and_a_dancer_is_a_person(tmp_path):
     people = read_people(save(tmp_path, rows), {}, None)
     assert len(people.items) == 1
     assert any("'dancer' taken as people's" in note for note in people.notes)
+    del rows[0]["mask"]
+    boxes = read_people(save(tmp_path, rows), {}, None)
+    assert "a.json: 1 boxes have no mask, which people need: left out" in boxes.notes
 
 
 # Things in one picture.

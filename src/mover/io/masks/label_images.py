@@ -280,7 +280,7 @@ def _of_stack(at: At, stack: NDArray[Any], names: Names, *, people: bool) -> Ins
     height, width = stack.shape[-2:]
     flat = stack.reshape(-1, height, width)
     rows, tracks, notes = len(flat), None, ()
-    bare = people and ids is None and frame is None and (stack.ndim < 4 or stack.shape[1] == 1)
+    bare = people and ids is None and frame is None and (stack.ndim < 4 or 1 in stack.shape[:2])
     in_frames = bare and rows > 1 and _follow_each_other(flat)
     if bare and rows > 1:
         how = "are people of one image; frames need an array 'frame' or 'object_ids' beside"
