@@ -1,5 +1,6 @@
 """A moving camera's poses come in from every tool's own layout, and wrong ones are refused."""
 
+import io
 import json
 import re
 import struct
@@ -296,6 +297,14 @@ REALSENSE = {**SIDES, "fx": FX, "fy": FY, "ppx": CX, "ppy": CY, "coeffs": [0.0] 
 DEPTH = {**SIDES, "fx": 380.0, "fy": 380.0, "ppx": 480.0, "ppy": 270.0}
 COLMAP = f"# Camera list\n1 PINHOLE 960 540 {FX} {FY} {CX + 0.5} {CY + 0.5}\n"
 BINARY = struct.pack("<QiiQQ4d", 1, 1, 1, 960, 540, FX, FY, CX + 0.5, CY + 0.5)
+
+
+def saved(write: Any, *given: Any, **named: Any) -> bytes:
+    file = io.BytesIO()
+    write(file, *given, **named)
+    return file.getvalue()
+
+
 LENSES: dict[str, tuple[str, str | bytes | dict[str, Any]]] = {
     "OpenCV's YAML": ("calib.yml", YAML), "ROS": ("head.yaml", ROS), "OpenCV's XML": ("c.xml", XML),
     "OpenCV's JSON": ("c.json", {**SIDES, "camera_matrix": {"data": np.ravel(K).tolist()}}),
@@ -303,6 +312,7 @@ LENSES: dict[str, tuple[str, str | bytes | dict[str, Any]]] = {
     "RealSense": ("rs.json", REALSENSE),
     "RealSense, all": ("all.json", {"serial": "1", "depth": DEPTH, "color": REALSENSE}),
     "Open3D": ("o.json", {**SIDES, "intrinsic_matrix": np.array(K).T.ravel().tolist()}),
+    "a dump of arrays": ("calib.npz", saved(np.savez, mtx=np.array(K), **SIDES)),
     "COLMAP": ("cameras.txt", COLMAP), "COLMAP, binary": ("cameras.bin", BINARY),
 }  # fmt: skip
 
@@ -332,6 +342,7 @@ NO_LENSES: dict[str, tuple[str, str | bytes | dict[str, Any], str]] = {
     "several": ("cameras.txt", COLMAP + COLMAP.replace("740.5", "800"), "2 cameras, expected one"),
     "cut off": ("cameras.bin", BINARY[:50], "cannot be read .it is damaged, cut off"),
     "no size": ("d.json", {"mtx": K}, "no width and height, expected .* give --image"),
+    "an array": ("K.npy", saved(np.save, np.array(K)), "no width and height, .* give --image"),
     "another matrix": ("d.json", {**SIDES, "K": [[1, 2], [3, 4]]}, "'K' has .*3 x 3 numbers"),
     "other words": ("d.json", {"hello": 1}, "one of the fields fl_x, fx, camera_mtx"),
     "text": ("cam_K.txt", "fx fy\n100 abc\n", r"'fx fy 100 abc'.*expected 3 x 3 numbers"),

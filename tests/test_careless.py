@@ -140,6 +140,10 @@ def test_two_cameras_of_a_capture_are_said(folder: Path) -> None:
     (folder / "scene.json").write_text(json.dumps(scene))
     (said,) = [text for text in read_capture(folder).warnings if "not camera.json" in text]
     assert said.startswith("scene.json: its camera counts")
+    scene["camera"] = tree | {"R_cam_world": [[1, 0, 0], [0, -0.8, 0.6], [0, -0.6, -0.8]]}
+    (folder / "scene.json").write_text(json.dumps(scene))
+    (said,) = [text for text in read_capture(folder).warnings if "not camera.json" in text]
+    assert "pitch -0.64 rad" in said
 
 
 BODIES: list[tuple[Callable[[np.ndarray], np.ndarray], str]] = [

@@ -168,6 +168,10 @@ def test_a_stack_of_frames_is_a_person_and_one_of_apart_masks_are_people(tmp_pat
     np.save(tmp_path / "frames.npy", np.stack([walker(k) for k in range(6)])[:, None])
     got = pixels(read_people(tmp_path / "frames.npy", {}, None))
     assert list(got) == [(k, 0) for k in range(6)]
+    np.save(tmp_path / "last.npy", np.stack([walker(k) for k in range(6)])[..., None])
+    np.save(tmp_path / "first.npy", np.stack([walker(k) for k in range(6)])[None])
+    for name in ("last.npy", "first.npy"):
+        assert list(pixels(read_people(tmp_path / name, {}, None))) == [(k, 0) for k in range(6)]
     np.save(tmp_path / "people.npy", np.stack([walker(0, k) for k in (0, 20, 40)])[:, None])
     found = read_people(tmp_path / "people.npy", {}, None)
     assert list(pixels(found)) == [(0, 0), (0, 1), (0, 2)]
@@ -186,6 +190,9 @@ def test_soft_labels_are_labels_and_a_dancer_is_a_person(tmp_path):
     people = read_people(save(tmp_path, rows), {}, None)
     assert len(people.items) == 1
     assert any("'dancer' taken as people's" in note for note in people.notes)
+    del rows[0]["mask"]
+    boxes = read_people(save(tmp_path, rows), {}, None)
+    assert "a.json: 1 boxes have no mask, which people need: left out" in boxes.notes
 
 
 # Things in one picture.
@@ -241,6 +248,9 @@ def test_of_many_images_only_ours_counts_and_this_is_said(tmp_path):
 @pytest.mark.parametrize(("name", "content", "words"), [
     ("a.json", [{"id": 1, "annotations": [{"result": []}], "data": {"image": "a"}}],
      "Label Studio's JSON, expected its export as COCO"),
+    ("a.json", [{"image": "a.jpg", "id": 1, "tag": [], "annotation_id": 3}], "Label Studio's JSON"),
+    ("a.json", [{"data": {"image": "a"}, "predictions": []}], "Label Studio's JSON"),
+    ("a.json", {"videos": [], "annotations": []}, "expected COCO's 'images' and 'annotations'"),
     ("a.json", {"a.jpg1": {"filename": "a.jpg", "regions": []}}, "project of VIA"),
     ("a.json", [{"image": "a.jpg", "id": 7}], r"\[0\].*bbox, segmentation or mask"),
     ("a.xml", "<?xml?><annotations><version>1.1</version></annotations>", "CVAT's XML"),
@@ -255,11 +265,29 @@ def test_what_is_not_read_is_named_with_its_export(name, content, words, tmp_pat
         read_things(tmp_path / name, {}, (W, H))
 
 
-@pytest.mark.parametrize("nothing", [[], [[]], None])
-def test_a_box_without_mask_is_a_box(nothing, tmp_path):
-    row = {"id": 1, "image_id": 0, "category_id": 1, "bbox": [4, 10, 14, 30],
-           "segmentation": nothing}  # fmt: skip
+def chair(folder: Path, drawn: Any, **more: Any) -> Instances:
+    row = {"id": 1, "image_id": 0, "category_id": 1, "segmentation": drawn, **more}
     tree = {"images": [{"id": 0, "width": W, "height": H}], "annotations": [row],
             "categories": [{"id": 1, "name": "chair"}]}  # fmt: skip
-    (item,) = read_things(save(tmp_path, tree), {}, None).items
+    return read_things(save(folder, tree), {}, None)
+
+
+@pytest.mark.parametrize("nothing", [[], [[]], None])
+def test_a_box_without_mask_is_a_box(nothing, tmp_path):
+    (item,) = chair(tmp_path, nothing, bbox=[4, 10, 14, 30]).items
     assert (item.box, item.mask) == ((4, 10, 18, 40), None)
+
+
+SQUARE = [[4, 10], [18, 10], [18, 40], [4, 40]]
+TEXT = {"size": f"[{H}, {W}]", "counts": compressed(runs(walker(0)))}
+
+
+@pytest.mark.parametrize("drawn", [[SQUARE], [SQUARE, []], TEXT])
+def test_other_spellings_of_a_mask_are_the_same_mask(drawn, tmp_path):
+    (mask,) = pixels(chair(tmp_path, drawn)).values()
+    assert (mask == walker(0)).all()
+
+
+def test_polygons_in_shares_of_the_image_are_refused(tmp_path):
+    with pytest.raises(InputError, match=r"segmentation' has .* shares .*, expected pixels"):
+        chair(tmp_path, [[0.1, 0.1, 0.5, 0.1, 0.5, 0.5]])

@@ -123,16 +123,16 @@ def test_another_piece_of_the_class_is_another_shape(name: str, seed: int) -> No
 
 
 WORDS = {
-    "chair": "Chair, chairs, SM_Chair_02, chair (2), chair_left, Dining Chair, Stuhl, СТУЛ",
+    "chair": "Chair, chairs, SM_Chair_02, chair (2), chair_left, Dining Chair, СТУЛ, Chair_A",
     "armchair": "Armchair01, recliner, rocking chair, Sofa_Chair, Lounge Chair / Cafe Chair",
-    "office chair": "swivel-chair, OfficeChair",
+    "office chair": "swivel-chair, OfficeChair, SM_Chair_Office_01, Bu\u0308rostuhl",
     "stool": "Ottoman, Footstool / Sofastool / Bed End Stool / Stool",
     "bar stool": "bar stool, BarStool.001, Barstools, counter stool",
     "sofa": "Couch, Couches, sofa bed, Studio couch, Three-Seat / Multi-seat Sofa, L-shaped Sofa",
     "bed": "bed, King-size Bed, bunk_bed, Betten / Bett",
     "table": "dining table, dining-table, DiningTable, Kitchen & dining room table, стол",
     "desk": "Dressing Table, Schreibtisch, office_desk",
-    "coffee table": "endtable, End_Table, Corner/Side Table, Tea Table",
+    "coffee table": "endtable, End_Table, Table_Coffee, Corner/Side Table, Tea Table",
     "shelf": "BOOKSHELF, bookcase, shelves, bookshelves, Bookcase / jewelry Armoire",
     "cabinet": "TVStand, chest of drawers; chest; bureau; dresser, file_cabinet, kitchen cabinets",
     "nightstand": "night_stand, Nightstand, bedside table", "floor lamp": "lamp, floor_lamp_1",

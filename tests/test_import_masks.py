@@ -82,9 +82,11 @@ def test_shapes_of_labelme_are_filled_and_those_of_a_group_are_one(tmp_path):
         ("lamp", [[50, 40], [45, 30]], "rectangle", None),
         ("chair", [[40, 10], [44, 10], [44, 14], [40, 14]], "polygon", 4),
         ("chair", [[0, 30], [8, 30], [8, 34], [0, 34]], "polygon", None),
+        ("floor", [[5, 5]], "point", None),
     ]
     found = read_instances(layouts.write_labelme(tmp_path / "a.json", shapes), {}, None)
     assert found.size == (64, 48)
+    assert found.notes == ("a.json: 1 shapes of points or lines are passed over",)
     assert [item.category for item in found.items] == ["chair", "lamp", "chair"]
     truth = np.zeros((3, 48, 64), dtype=bool)
     truth[0, 10:25, 10:30] = truth[0, 10:14, 40:44] = True

@@ -466,6 +466,12 @@ def test_a_motion_of_amass_given_as_bodies_is_named(write, tmp_path):
     with pytest.raises(InputError, match=r"no key .*motion of AMASS.*import-bodies amass"):
         bodies_from("gvhmr", path, KNOWN)
     assert len(bodies_from("amass", path).bodies.frame) == 5
+    parts = load(path)  # as SMPL-X's motions are, too: its parts without the whole
+    whole = parts.pop("poses")
+    np.savez(path, **parts, root_orient=whole[:, :3], pose_body=whole[:, 3:66])
+    pose = bodies_from("amass", path).bodies.pose
+    assert pose is not None
+    assert pose.body_pose.numpy() == pytest.approx(whole[:, 3:66], abs=1e-5)
 
 
 # What is no file of the tool at all: a pointer, a page, a part, nothing.
@@ -569,6 +575,11 @@ def test_pieces_of_whams_walker_are_one_person_and_the_user_can_join_more(tmp_pa
     assert "4 and 17 (frames 11 and 40) may be one person; --tracks 17=4" in found.warnings[-1]
     known = replace(KNOWN, tracks={17: 4})
     assert bodies_from("wham", path, known).bodies.person.unique().tolist() == [0]
+    made.dump({f"person_{track}": one for track, one in tracks.items()}, path)
+    assert bodies_from("wham", path, KNOWN).bodies.person.unique().tolist() == [0, 17]
+    made.dump({"poses": np.zeros((5, 72)), "trans": np.zeros((5, 3))}, path)
+    with pytest.raises(InputError, match=r"'poses' has .* a person under the number of a track"):
+        bodies_from("wham", path, KNOWN)
 
 
 # Keypoints.

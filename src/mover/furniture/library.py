@@ -2,6 +2,7 @@
 
 import difflib
 import re
+import unicodedata
 from collections.abc import Callable, Iterable
 from functools import cache, partial
 
@@ -212,17 +213,11 @@ def _known_names() -> dict[str, str]:
 
 def _spelled(text: str) -> str:
     """Lower case without punctuation, numbers, CamelCase: `dining table` of SM_DiningTable_02."""
+    text = unicodedata.normalize("NFC", text)  # macOS writes an umlaut of a file as two signs
     parted = re.sub(
         r"(?<=[a-z\u0430-\u0451ß])(?=[A-Z\u0410-\u042f])|(?<=[A-Z])(?=[A-Z][a-z])", " ", text
     )
     return " ".join(re.sub(r"[\W\d_]+", " ", parted).lower().split())
-
-
-def _singular(name: str) -> str | None:
-    """A known name of which this is the plural, or the name itself where it is known."""
-    endings = (("", ""), ("s", ""), ("es", ""), ("ves", "f"), ("ies", "y"))
-    forms = (name[: len(name) - len(old)] + new for old, new in endings if name.endswith(old))
-    return next((form for form in forms if form in _known_names()), None)
 
 
 @cache
@@ -233,14 +228,15 @@ def plain_name(category: str) -> str:
     name its last words (a leather sofa is a sofa).
     """
     parts = [_spelled(part) for part in re.split(r"[,;/|(]", category)]
-    short = [" ".join(w for w in part.split() if w not in NOISE.split()) for part in parts]
-    for name in (*parts, *short):
-        if (found := _singular(name)) is not None:
-            return found
-    for words in (name.split() for name in short):
-        for start in range(1, len(words)):
-            if (found := _singular(" ".join(words[start:]))) is not None:
-                return found
+    words = [[w for w in part.split() if w not in NOISE.split() and len(w) > 1] for part in parts]
+    short = [" ".join(some) for some in words]
+    turned = (" ".join(some[::-1]) for some in words)  # Table_Coffee
+    tails = (" ".join(some[k:]) for some in words for k in range(1, len(some)))
+    for name in (*parts, *short, *turned, *tails):  # as it is, or as a plural of a known name
+        for old, new in (("", ""), ("s", ""), ("es", ""), ("ves", "f"), ("ies", "y")):
+            form = name.removesuffix(old) + new if name.endswith(old) else ""
+            if form in _known_names():
+                return form
     whole = _spelled(category)
     return short[0] if len(parts) == 1 and short[0] else whole or category.strip().lower()
 

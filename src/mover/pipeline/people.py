@@ -180,8 +180,8 @@ def check_floor(ground: float, capture: Capture) -> tuple[str, ...]:
         if capture.bodies is not None:
             cause = "bodies.npz: the feet of the people"
         raise InputError(
-            f"{cause} put the floor {abs(ground):.3g} m {side} the camera, expected"
-            f" {-HIGHEST:g} to {-LOWEST:g} m below; are places in metres, and is z forward?"
+            f"{cause} put the floor {abs(ground):.3g} m {side} the camera, expected {-HIGHEST:g} to"
+            f" {-LOWEST:g} m below; are places in metres, z forward, and R_cam_world upright?"
         )
     given = capture.scene.ground
     if given is None or abs(given - ground) <= APART:

@@ -6,6 +6,7 @@ import torch
 
 from mover.core.errors import InputError
 from mover.core.types import STILL, Bodies, Camera, Capture, Detection, Scene
+from mover.geometry.camera import pitch_roll
 from mover.geometry.path import is_still
 from mover.geometry.rotations import rot_y
 from mover.io.capture.annotations_file import PeopleFile, detections_of, furniture_of, people_of
@@ -37,7 +38,7 @@ def build_capture(parts: Parts) -> Capture:
     warn = warnings.append
     scene, turn = scene_of(parts.scene, parts.load_mesh, camera_of(parts.camera), warn)
     camera, lens = scene.camera, checked(parts.camera, CameraFields)
-    if (other := _lens(camera_of(parts.camera))) != _lens(camera):
+    if (other := _lens(camera_of(parts.camera, camera))) != _lens(camera):
         warn(f"scene.json: its camera counts ({_lens(camera)}), not camera.json ({other}); "
              "give one in both")  # fmt: skip
     detections = detections_of(parts.objects, camera, warn)
@@ -76,10 +77,10 @@ def build_capture(parts: Parts) -> Capture:
 
 
 def _lens(camera: Camera) -> str:
-    """Size and lens as a message names them."""
-    K = camera.K.tolist()
+    """Size, lens and tilt as a message names them."""
+    K, tilt = camera.K.tolist(), [round(float(v), 2) + 0.0 for v in pitch_roll(camera.R_cam_world)]
     lens = f"fl_x {K[0][0]:.4g}, fl_y {K[1][1]:.4g}, cx {K[0][2]:.4g}, cy {K[1][2]:.4g}"
-    return f"{camera.width} x {camera.height}, {lens}"
+    return f"{camera.width} x {camera.height}, {lens}, pitch {tilt[0]} rad, roll {tilt[1]} rad"
 
 
 def _check_annotations(

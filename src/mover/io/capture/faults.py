@@ -258,6 +258,7 @@ def _times(capture: Capture, found: Agreement) -> Iterator[Fault]:
     fits[shared < max(FEWEST, int(shared.max()) / 2)] = -1
     if float(fits.max()) < FITTED_TIME:
         return
+    fits = fits * (shared / shared.max()).sqrt().sqrt()  # few rows fit by chance
     name = list(changes)[int(fits.argmax())]
     cure = "number the frames of bodies and masks as those of one video (--fps), from 0"
     yield Fault(f"bodies.npz: {name}", cure, partial(mends.retimed, *changes[name]), TIME_MARGIN)

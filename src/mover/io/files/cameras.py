@@ -16,6 +16,7 @@ from mover.core.errors import InputError
 from mover.core.files import unreadable
 from mover.geometry.camera import tilted
 from mover.io.files.fields import LARGEST, At, read_json
+from mover.io.files.npz import read_npy, read_npz
 from mover.io.files.schema import Positive, Side, checked
 
 log = logging.getLogger(__name__)
@@ -87,6 +88,10 @@ def read_camera_file(path: Path, size: Size) -> At:
             if tree.maybe(*MATRIX) is None:
                 tree.refuse(f"a matrix of the camera ({', '.join(MATRIX)})", "none")
             return camera_of_tree(tree, size)
+        case ".npz" | ".npy":  # np.savez(..., mtx=, dist=), or the matrix alone
+            tree = read_npz(path).value if path.suffix == ".npz" else {"mtx": read_npy(path).value}
+            tree = {key: np.asarray(value).tolist() for key, value in tree.items()}
+            return camera_of_tree(At(tree, path.name), size)
         case _:
             if rows := _colmap_rows(path):
                 return _of_colmap(rows, path.name)

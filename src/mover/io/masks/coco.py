@@ -63,6 +63,7 @@ def from_coco(segmentation: Any, height: int, width: int, where: str) -> bytes: 
         kinds = "polygons [[x, y, ...], ...] or a run-length code {size, counts}"
         _wrong(where, type(segmentation).__name__, kinds)
     size, counts = segmentation.get("size"), segmentation.get("counts")
+    size = _unprinted(size, size) if isinstance(size, str) else size
     if not isinstance(size, list | tuple) or tuple(size) != (height, width):
         _wrong(where, f"size {str(size)[:40]}", f"[{height}, {width}] (h, w)")
     runs = _runs(counts, where)
@@ -90,10 +91,16 @@ def _nested(polygons: Sequence[Any]) -> Sequence[Any]:
     """Polygons, where a single one may be written as x, y, ... or as pairs (x, y)."""
     if polygons and all(type(v) in (int, float) for v in polygons):
         return [polygons]
-    pairs = [p for p in polygons if isinstance(p, list | tuple) and len(p) == 2]
-    if len(pairs) == len(polygons) >= CORNERS:
-        return [[v for pair in pairs for v in pair]]
-    return [p for p in polygons if p not in ([], ())]
+    if len(polygons) >= CORNERS and _are_pairs(polygons):
+        polygons = [polygons]
+    flat = [[v for pair in p for v in pair] if _are_pairs(p) else p for p in polygons]
+    return [p for p in flat if p not in ([], ())]
+
+
+def _are_pairs(polygon: Any) -> bool:  # noqa: ANN401
+    """Whether corners are written as pairs (x, y)."""
+    pairs = polygon if isinstance(polygon, list | tuple) else ()
+    return bool(pairs) and all(isinstance(p, list | tuple) and len(p) == 2 for p in pairs)
 
 
 def is_drawn(segmentation: Any) -> bool:  # noqa: ANN401
@@ -128,10 +135,12 @@ def _check_polygon(polygon: Any, reach: float, where: str, what: str) -> None:  
         _wrong(where, f"{what} text ({words[0][:40]!r})", "numbers x, y without quotes")
     real = all(type(v) in (int, float) for v in given)
     if not real or len(given) < 2 * CORNERS or len(given) % 2:
-        found = f"{len(given)} items" if polygon is given else str(polygon)[:40]
+        found = f"{len(given)} items" if polygon is given and real else str(polygon)[:40]
         _wrong(where, f"{what} {found}", f"numbers x, y of {CORNERS} corners or more")
     if not all(-reach <= v <= reach for v in given):
         _wrong(where, f"{what} a corner far outside", "pixels of the image")
+    if all(0 <= v <= 1 for v in given):
+        _wrong(where, f"{what} shares of the image (0 to 1)", "pixels: times width and height")
 
 
 def check_image(at: At, camera: Camera) -> int:

@@ -170,9 +170,8 @@ def _of_json(at: At, names: Names, size: Size | None, picture: str | None) -> In
     keys = [set(row) if isinstance(row, dict) else set[str]() for row in rows]
     inner = at.value.values() if isinstance(at.value, dict) else ()
     foreign = {
-        "Label Studio's JSON": any(
-            {"data", "annotations"} <= k or "completions" in k for k in keys
-        ),
+        "Label Studio's JSON": any(k & {"completions", "annotation_id", "lead_time"} for k in keys)
+        or any("data" in k and k & {"annotations", "predictions"} for k in keys),
         "a project of VIA": any("_via_img_metadata" in one for one in keys)
         or any(isinstance(row, dict) and "regions" in row for row in inner),
         "COCO's panoptic JSON": "segments_info" in str(at.value)[:100_000],
@@ -191,13 +190,13 @@ def _of_json(at: At, names: Names, size: Size | None, picture: str | None) -> In
         rows = [{**row.mapping(), "image_id": 0} for row in at.get("annotations").items()]
         tree = {"images": [{**at.get("image").mapping(), "id": 0}], "annotations": rows}
         return coco_instances(at.holding(tree), names, size, picture)
-    if "annotations" in have:
+    if {"annotations", "images"} <= have:
         return coco_instances(at, names, size, picture)
     if "shapes" in have:
         return labelme_instances(at)
     if "mask_name" in have:
         raise InputError(f"{at.file}: has no masks, expected the folder mask_data beside json_data")
-    known = "COCO's 'annotations', labelme's 'shapes' or a list of detections"
+    known = "COCO's 'images' and 'annotations', labelme's 'shapes' or a list of detections"
     raise InputError(f"{at.file}: has the keys {sorted(have)[:5]}, expected {known}")
 
 
@@ -208,6 +207,11 @@ class ImageFields(Struct, frozen=True):
     width: Side | None = None
     height: Side | None = None
     file_name: Any = None
+
+    @property
+    def size(self) -> Size | None:
+        """Its own [px]."""
+        return (self.width, self.height) if self.width and self.height else None
 
     @property
     def stem(self) -> str:
@@ -258,7 +262,8 @@ def coco_instances(
         rows = [(item, row) for item, row in rows if row.image_id == ours.id]
     if picture is not None and len(rows) > MOST_THINGS:
         at.get("annotations").refuse(f"at most {MOST_THINGS} in a picture", f"{len(rows)} items")
-    sizes = {image.id: _size_of_image(item, image, size) for item, image in listed}
+    need = "width and height, here or by --image"
+    sizes = {i.id: i.size or size or item.refuse(need) for item, i in listed}
     tracked = any(row.track_id is not None for _, row in rows)
     frames, more = _frames_of_images([image for _, image in listed], at.file, tracked=tracked)
     found = [_instance(item, row, sizes[row.image_id or 0], words, frames) for item, row in rows]
@@ -266,12 +271,6 @@ def coco_instances(
         at.get("images").refuse("images of one size", f"{len(set(sizes.values()))} sizes")
     looked, own = frozenset(frames.values()), next(iter(sizes.values()), size)
     return Instances(tuple(found), own, at.file, looked, (*notes, *more))
-
-
-def _size_of_image(at: At, image: ImageFields, size: Size | None) -> Size:
-    """Width and height of an image: its own, else the known ones [px]."""
-    own = (image.width, image.height) if image.width and image.height else size
-    return own or at.refuse("width and height, here or by --image")
 
 
 def _ours(

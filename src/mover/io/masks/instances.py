@@ -98,6 +98,8 @@ class Instances:
                 wanted = "expected masks of people"
                 raise InputError(f"{self.file}: has no people, only {named}, {wanted}")
             notes.append(f"{named} taken as people's")
+        if bare := sum(item.mask is None for item in kept):
+            notes.append(f"{self.file}: {bare} boxes have no mask, which people need: left out")
         return dataclasses.replace(self, items=tuple(kept), notes=tuple(notes))
 
     def objects_tree(self) -> At:

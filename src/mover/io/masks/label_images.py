@@ -248,6 +248,8 @@ def read_mask_arrays(path: Path, names: Names, *, people: bool = False) -> Insta
     if given is None:
         at.refuse(f"an array named {', '.join(MASKS)}", f"the arrays {sorted(at.value)[:6]}")
     stack = given.value
+    if isinstance(stack, np.ndarray) and stack.ndim == 4 and stack.shape[-1] == 1:
+        stack = np.moveaxis(stack, -1, 1)  # (frames, h, w, 1)
     if not isinstance(stack, np.ndarray) or stack.dtype.kind not in "buif" or stack.ndim < 2:
         given.refuse("an array of masks (n, h, w), (frames, objects, h, w) or labels (h, w)")
     if stack.ndim == 2 and stack.dtype != np.bool_ and not (np.nan_to_num(stack) % 1).any():
@@ -278,7 +280,7 @@ def _of_stack(at: At, stack: NDArray[Any], names: Names, *, people: bool) -> Ins
     height, width = stack.shape[-2:]
     flat = stack.reshape(-1, height, width)
     rows, tracks, notes = len(flat), None, ()
-    bare = people and ids is None and frame is None and (stack.ndim < 4 or stack.shape[1] == 1)
+    bare = people and ids is None and frame is None and (stack.ndim < 4 or 1 in stack.shape[:2])
     in_frames = bare and rows > 1 and _follow_each_other(flat)
     if bare and rows > 1:
         how = "are people of one image; frames need an array 'frame' or 'object_ids' beside"

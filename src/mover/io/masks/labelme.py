@@ -15,6 +15,7 @@ from mover.io.files.schema import Side, Text, checked
 from mover.io.masks.instances import Instance, Instances, Size, code_in, code_of
 
 CORNERS = 64  # of the polygon that stands for a circle
+WITHOUT_AREA = ("point", "points", "line", "linestrip")
 
 
 class LabelmeFields(Struct, frozen=True, rename="camel"):
@@ -42,7 +43,9 @@ def labelme_instances(at: At) -> Instances:
     tree = checked(at, LabelmeFields)
     size = tree.image_width, tree.image_height
     groups: dict[tuple[str, int | None], list[Any]] = {}
-    for index, item in enumerate(at.get("shapes").items()):
+    items = at.get("shapes").items()
+    areas = [x for x in items if x.mapping().get("shape_type") not in WITHOUT_AREA] or items
+    for index, item in enumerate(areas):
         shape = checked(item, ShapeFields)
         kind = item.get("shape_type").choice(("polygon", "rectangle", "circle", "mask"))
         key = str(shape.label), -1 - index if shape.group_id is None else shape.group_id
@@ -58,7 +61,8 @@ def labelme_instances(at: At) -> Instances:
     for (label, _), codes in groups.items():
         whole: Any = coco.merge(codes) if codes else {}
         found.append(Instance(label, None, whole.get("counts")))
-    return Instances(tuple(found), size, at.file)
+    said = f"{at.file}: {len(items) - len(areas)} shapes of points or lines are passed over"
+    return Instances(tuple(found), size, at.file, notes=(said,) if areas != items else ())
 
 
 def _outline(kind: str, points: list[tuple[float, float]]) -> list[tuple[float, float]]:

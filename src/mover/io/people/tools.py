@@ -43,6 +43,7 @@ SHAPES = 10  # coefficients where none are given
 FOCAL = 5000.0  # [px], SMPLify-X's default, and of HMR2's crops
 CROP = 256.0  # [px], a side of these crops
 AMASS = {156: "smplh", 165: "smplx", 72: "smpl"}
+AMASS_PARTS = {"root_orient": 3, "pose_body": 63, "pose_jaw": 3, "pose_eye": 6, "pose_hand": 90}
 """Body models by the numbers of a row of `poses`."""
 NO_CAMERA = "is a motion in a world of its own: where the camera saw the people is not known"
 Y_UP = np.array([[1, 0, 0, 0, 0, 1, 0, -1, 0]])  # AMASS has +z up
@@ -384,7 +385,12 @@ def amass(path: Path, _: Known) -> Iterator[Person]:
     """Motions of AMASS: one npz a person."""
     for track, file in enumerate(v.files_of(path, "*.npz", "motions of AMASS")):
         at = v.read_any(file)
-        width = v.rows(need(at, "poses"), len(v.stacked(need(at, "trans"), 3))).shape[1]
+        count = len(v.stacked(need(at, "trans"), 3))
+        if at.maybe("poses") is None and at.maybe("pose_body") is not None:
+            given = [(at.maybe(name), width) for name, width in AMASS_PARTS.items()]
+            rows = [np.zeros((count, n)) if x is None else v.rows(x, count, n) for x, n in given]
+            at = at.holding({**at.mapping(), "poses": np.concatenate(rows, 1)})
+        width = v.rows(need(at, "poses"), count).shape[1]
         if width not in AMASS:
             need(at, "poses").refuse(f"rows of {' or '.join(map(str, AMASS))} angles")
         at = at.holding({**at.mapping(), "turn": Y_UP, "shift": np.zeros(3)})

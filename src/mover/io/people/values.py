@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -126,12 +126,14 @@ def people_of(at: At) -> list[tuple[int, At]]:
     if not given:
         raise InputError(f"{at.place} has no people, expected at least one track")
     keys = [str(key) for key in given]
-    numbered = all(key.isdigit() for key in keys)
+    tracks = [number_in(key, index) for index, key in enumerate(keys)]  # 17 of 17, of person_17
+    tracks = tracks if len(set(tracks)) == len(keys) else list(range(len(keys)))
     people: list[tuple[int, At]] = []
-    for index, (key, value) in enumerate(zip(keys, given.values(), strict=True)):
+    for track, key, value in zip(tracks, keys, given.values(), strict=True):
         person = At(value, at.file, f"{at.field}.{key}" if at.field else key)
-        person.mapping()
-        people.append((int(key) if numbered else index, person))
+        if not isinstance(value, Mapping):
+            person.refuse("the fields of a person under the number of a track")
+        people.append((track, person))
     return people
 
 
