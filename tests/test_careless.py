@@ -152,9 +152,7 @@ BODIES: list[tuple[Callable[[np.ndarray], np.ndarray], str]] = [
 
 
 @pytest.mark.parametrize(("change", "words"), BODIES)
-def test_bodies_of_another_unit_or_frame_are_named(
-    change: Callable[[np.ndarray], np.ndarray], words: str, folder: Path
-) -> None:
+def test_bodies_of_another_unit_or_frame_are_named(change, words, folder):
     arrays = tiny.bodies()
     verts = arrays["vertices"]
     size = np.linalg.norm(verts.max(1) - verts.min(1), axis=1).mean()
@@ -202,9 +200,7 @@ def test_poses_under_which_people_move_too_much_are_named(words: str) -> None:
     assert all(words in text for text in said)
 
 
-def test_a_capture_is_no_result_and_a_file_no_capture(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_capture_is_no_result_and_a_file_no_capture(folder, capsys):
     for command, words in (
         (["export", str(folder), "--to", "glb"], "is a capture, expected a result"),
         (["evaluate", str(folder), "--truth", str(folder)], "is a capture, expected a result"),
@@ -215,9 +211,7 @@ def test_a_capture_is_no_result_and_a_file_no_capture(
         assert words in capsys.readouterr().err
 
 
-def test_keypoints_of_another_size_of_the_video_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_keypoints_of_another_size_of_the_video_are_refused(tmp_path, capsys):
     points = np.random.default_rng(0).uniform([300, 100], [1200, 700], (4, 25, 2))
     np.savez(tmp_path / "k.npz", layout=np.array("openpose25"), frame=np.arange(4),
              person=np.zeros(4, int), points=points, confidence=np.ones((4, 25)))  # fmt: skip

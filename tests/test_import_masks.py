@@ -49,7 +49,6 @@ def drawn() -> np.ndarray:
 
 
 def drawn_of(item: Instance, height: int = 48, width: int = 64) -> np.ndarray:
-    assert item.mask is not None
     return decode(Masks(height, width, (item.mask,)), 0).numpy()
 
 

@@ -86,9 +86,7 @@ def crowd(*people: tuple[float, float]) -> np.ndarray:
     return picture
 
 
-def test_several_people_are_found_upright_in_the_pixels_of_the_picture(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_several_people_are_found_upright_in_the_pixels_of_the_picture(tmp_path, monkeypatch):
     one, two = PEOPLE
     for k, people in enumerate([(one, two), (two,), (), (one, two)]):
         write_jpeg(crowd(*people), tmp_path / f"{k:06d}.jpg")
@@ -216,18 +214,13 @@ class TestWeights:
             needs.fetch(print, source)
             assert (needs.folder() / needs.LANDMARKS).read_bytes()[-1:] == last
 
-    @pytest.mark.parametrize(
-        ("name", "content", "words"),
-        [
-            ("m.whl", b"PK", "cannot be read"),
-            ("m.whl", None, "is not that of mediapipe==0.10.21"),
-            ("m.task", None, "cannot be read"),
-            ("m.tflite", b"nonsense", "no network of TensorFlow Lite"),
-        ],
-    )
-    def test_what_is_no_network_is_refused(
-        self, name: str, content: bytes | None, words: str, tmp_path: Path
-    ):
+    @pytest.mark.parametrize(("name", "content", "words"), [
+        ("m.whl", b"PK", "cannot be read"),
+        ("m.whl", None, "is not that of mediapipe==0.10.21"),
+        ("m.task", None, "cannot be read"),
+        ("m.tflite", b"nonsense", "no network of TensorFlow Lite"),
+    ])  # fmt: skip
+    def test_what_is_no_network_is_refused(self, name, content, words, tmp_path):
         path = tmp_path / name
         if content is None:
             self.archive(path, dict.fromkeys(needs.IN_WHEEL, b"\0\0\0\0TFL3other"))

@@ -251,9 +251,7 @@ def test_a_network_of_this_size_runs_on_a_mesh():
     assert is_closed(occupied_mesh(network_of(state), CORNER, SMALL).faces)
 
 
-def test_furniture_is_closed_by_the_checkpoint_that_the_user_names(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_furniture_is_closed_by_the_checkpoint_that_the_user_names(tmp_path, monkeypatch):
     """`--prepare.watertight occnet --prepare.occnet FILE`, on files in the published layout."""
     from test_prepare_objects import LIGHT, off_centre_box, piece_of
 

@@ -137,16 +137,12 @@ def test_a_person_seated_across_to_a_lying_one_is_on_a_sofa_as_long_as_both():
     assert lying.abs().max() > half - 0.45
 
 
-@pytest.mark.parametrize(
-    "bodies",
-    [
-        somewhere(people(pose(ARMS_DOWN, COUNT), fps=5.0)),
-        somewhere(moving(people(pose(STRIDE, COUNT), fps=5.0), 0.0, 0.0, 0.2)),
-        somewhere(people(LYING, fps=5.0)),
-        sitters(count=4),
-    ],
-    ids=["stands", "walks", "lies on the floor", "hardly sits"],
-)
+@pytest.mark.parametrize("bodies", [
+    somewhere(people(pose(ARMS_DOWN, COUNT), fps=5.0)),
+    somewhere(moving(people(pose(STRIDE, COUNT), fps=5.0), 0.0, 0.0, 0.2)),
+    somewhere(people(LYING, fps=5.0)),
+    sitters(count=4),
+], ids=["stands", "walks", "lies on the floor", "hardly sits"])  # fmt: skip
 def test_nothing_is_proposed_for_who(bodies: Bodies):
     assert missing(bodies) == []
 

@@ -135,13 +135,10 @@ class TestFile:
         for one, other in zip(a.objects, b.objects, strict=True):
             assert torch.equal(one.t_world_object, other.t_world_object)
 
-    @pytest.mark.parametrize(
-        ("field", "value"),
-        [
-            ("do", "throw"), ("id", ""), ("yaw", "left"), ("scale", [1, 0, 1]), ("pitch", 9),
-            ("translation", [1, 2]),
-        ],
-    )  # fmt: skip
+    @pytest.mark.parametrize(("field", "value"), [
+        ("do", "throw"), ("id", ""), ("yaw", "left"), ("scale", [1, 0, 1]), ("pitch", 9),
+        ("translation", [1, 2]),
+    ])  # fmt: skip
     def test_says_which_field_is_wrong(self, tmp_path: Path, field: str, value: object):
         file = tmp_path / "edits.json"
         write_edits(every_edit(), file)
