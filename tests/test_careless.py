@@ -13,6 +13,8 @@ from PIL import Image
 
 from mover.app.cli import run_command
 from mover.core.errors import InputError
+from mover.core.types import Masks
+from mover.geometry.rle import decode
 from mover.io.capture.camera_file import path_of
 from mover.io.capture.folder import read_capture
 from mover.io.capture.parts import UNKNOWN
@@ -35,7 +37,9 @@ ROWS = {  # a chair of x 10 to 30 and y 8 to 40, or its box, as tools write it
 def test_rows_of_other_tools_are_read(tool: str, tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(json.dumps(ROWS[tool]))
     (found,) = read_things(tmp_path / "a.json", {}, SIZE).items
-    assert found.mask is not None
+    mask = decode(Masks(*SIZE[::-1], (found.mask,)), 0)
+    assert mask[8:40, 10:30].all()
+    assert mask.sum() == 20 * 32
     assert found.box == pytest.approx((10, 8, 30, 40))
     assert found.category == ("chair" if tool == "ultralytics" else UNKNOWN)
 
@@ -57,7 +61,15 @@ MASKS: dict[str, tuple[Any, str]] = {  # what a file or the only file of a folde
     "photo.jpg": (photo, "values, as a photo, expected a mask"),
     "a.png": (HEIC, "HEIC"),
     "v.png": (b"\0\0\0\x18ftypmp42", "a video: save one of its frames"),
-}
+    "studio.json": ([{"id": 1, "annotations": [{"result": []}], "data": {"image": "a"}}],
+                    "Label Studio's JSON, expected its export as COCO"),
+    "via.json": ({"a.jpg1": {"filename": "a.jpg", "regions": []}}, "project of VIA"),
+    "rows.json": ([{"image": "a.jpg", "id": 7}], r"\[0\].*bbox, segmentation or mask"),
+    "cvat.xml": (b"<?xml?><annotations><version>1.1</version></annotations>", "CVAT's XML"),
+    "voc.xml": (b"<annotation><object/></annotation>", "an XML of Pascal VOC"),
+    "yolo.txt": (b"56 0.31 0.6 0.2 0.4", "YOLO's text"),
+    "masks.zip": (b"PK", "unpack it"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", MASKS)
