@@ -91,12 +91,11 @@ def write_out(out: Path, scene: Scene, bodies: Bodies | None = None) -> Path:
     return out
 
 
-def similar(bodies: Bodies, size: float = 1.0) -> tuple[Bodies, torch.Tensor]:
+def similar(bodies: Bodies, size: float) -> Bodies:
     """The same people seen in other axes and grown about the new origin, without parameters."""
     c, s = math.cos(0.4), math.sin(0.4)
     turn = torch.tensor([[1.0, 0, 0], [0, c, -s], [0, s, c]]) @ torch.diag(
         torch.tensor([1.0, -1, -1])
     )
-    verts = size * bodies.verts @ turn.mT
-    joints = size * bodies.joints @ turn.mT
-    return dataclasses.replace(bodies, verts=verts, joints=joints, pose=None), turn
+    verts, joints = (size * x @ turn.mT for x in (bodies.verts, bodies.joints))
+    return dataclasses.replace(bodies, verts=verts, joints=joints, pose=None)

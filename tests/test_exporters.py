@@ -184,7 +184,7 @@ def test_bodies_without_parameters_still_move_and_have_no_bones_and_no_parameter
 
 def test_parameters_of_the_capture_move_bodies_that_were_turned_and_sized(tmp_path):
     truth, scene = two_people(), scaled(furnished())
-    grown, _ = similar(truth, 1.03)
+    grown = similar(truth, 1.03)
     result, given = replace(grown, space="world"), replace(truth, space="camera")
     home = Finished(write_out(tmp_path / "out", scene), scene, result, given)
     glb = Glb(export_glb(home, tmp_path).files[0])
