@@ -51,16 +51,10 @@ def people(base: BodyPose, fps: float | None = None, floor: float = 0.0) -> Bodi
     lift = floor - verts[0, :, 1].min()
     count = len(verts)
     return Bodies(
-        verts=verts + torch.tensor([0.0, 1.0, 0.0]) * lift,
-        faces=model.faces,
-        joints=None,
-        joint_names=(),
-        frame=torch.arange(count),
-        person=torch.zeros(count, dtype=torch.long),
-        fps=fps,
-        space="world",
-        pose=base,
-    )
+        verts=verts + torch.tensor([0.0, 1.0, 0.0]) * lift, faces=model.faces, joints=None,
+        joint_names=(), frame=torch.arange(count), person=torch.zeros(count, dtype=torch.long),
+        fps=fps, space="world", pose=base,
+    )  # fmt: skip
 
 
 def moving(bodies: Bodies, *step: float) -> Bodies:

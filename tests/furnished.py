@@ -70,8 +70,6 @@ def two_people(frames: int = 12) -> Bodies:
     first, second = bodies_of(moving_pose(frames)), bodies_of(moving_pose(frames, 1))
     late = second.frame + 10 + 30 * (torch.arange(frames) >= frames // 2)
     pose = first.pose
-    assert pose is not None
-    assert second.pose is not None
     names = ("betas", "global_orient", "body_pose", "transl")
     both = {n: torch.cat([getattr(pose, n), getattr(second.pose, n)]) for n in names}
     hands = torch.cat([b.extra["left_hand_pose"] for b in (pose, second.pose)])
@@ -93,13 +91,11 @@ def write_out(out: Path, scene: Scene, bodies: Bodies | None = None) -> Path:
     return out
 
 
-def similar(bodies: Bodies, size: float = 1.0) -> tuple[Bodies, torch.Tensor]:
+def similar(bodies: Bodies, size: float) -> Bodies:
     """The same people seen in other axes and grown about the new origin, without parameters."""
     c, s = math.cos(0.4), math.sin(0.4)
     turn = torch.tensor([[1.0, 0, 0], [0, c, -s], [0, s, c]]) @ torch.diag(
         torch.tensor([1.0, -1, -1])
     )
-    verts = size * bodies.verts @ turn.mT
-    assert bodies.joints is not None
-    joints = size * bodies.joints @ turn.mT
-    return dataclasses.replace(bodies, verts=verts, joints=joints, pose=None), turn
+    verts, joints = (size * x @ turn.mT for x in (bodies.verts, bodies.joints))
+    return dataclasses.replace(bodies, verts=verts, joints=joints, pose=None)

@@ -66,8 +66,6 @@ def some(bodies: Bodies, every: int = 8) -> Bodies:
 def thinned(capture: Capture, every: int = 8) -> Capture:
     """Every so many frames of the people."""
     bodies, people = capture.bodies, capture.people
-    assert bodies is not None
-    assert people is not None
     rows = (people.frame % every == 0).nonzero()[:, 0]
     counts = tuple(people.masks.counts[k] for k in rows.tolist())
     fewer = replace(

@@ -38,8 +38,6 @@ def write_body_model(folder: Path) -> Path:
 def smplx_people(room: KnownRoom, rows: list[int], model: SkinnedBody) -> BodyPose:
     """Some rows of the people, the pelvis where it was; hands at rest."""
     given = rows_of(room.bodies, torch.tensor(rows))
-    assert given.pose is not None
-    assert given.joints is not None
     pose = replace(
         given.pose, model="smplx", gender="male", extra={}, betas=torch.zeros(len(rows), 10),
         body_pose=given.pose.body_pose[:, :63],
@@ -87,7 +85,6 @@ def _write_keypoints(path: Path, pixels: torch.Tensor) -> None:
 def _write_index(path: Path, room: KnownRoom, row: int) -> None:
     """The body index of a picture as it is stored, mirrored; the room's masks are smaller."""
     people = room.capture.people
-    assert people is not None
     own = (people.frame == room.bodies.frame[row]) & (people.person == room.bodies.person[row])
     mask = decode(people.masks, int(own.nonzero()[0, 0])).numpy()[:, ::-1]
     factor = SIZE[0] // mask.shape[1]
@@ -115,7 +112,6 @@ def write_object_masks(path: Path, plain: layouts.Room, room: KnownRoom) -> Path
     names = list(dict.fromkeys(t.category for t in plain.things))
     rows = []
     for i, (thing, found) in enumerate(zip(plain.things, room.capture.detections, strict=True)):
-        assert found.mask is not None
         mask = decode(found.mask, 0).numpy()
         factor = SIZE[0] // mask.shape[1]
         runs = tiny.runs(np.kron(mask, np.ones((factor, factor), dtype=bool)))

@@ -50,9 +50,7 @@ def test_a_missing_object_counts_as_none_after_the_similarity_too() -> None:
 
 
 @pytest.mark.parametrize(("off", "by_10"), [(0.05, 0), (0.15, 1), (-0.3, 1), (0.7, 1)])
-def test_objects_that_end_farther_from_the_truth_than_given_are_counted(
-    off: float, by_10: int
-) -> None:
+def test_objects_that_end_farther_from_the_truth_than_given_are_counted(off, by_10):
     truth = room()
     found = evaluate(truth, moved(truth, 0, off), truth)
     count = len(truth.objects)

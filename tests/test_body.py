@@ -174,18 +174,6 @@ def test_gradients_of_all_parameters_are_right():
     assert torch.autograd.gradcheck(posed, [v.clone().requires_grad_() for v in values])
 
 
-def test_people_in_one_batch_do_not_mix():
-    first, second = pose(SEATED), replace(pose(ARMS_DOWN), betas=torch.full((1, 10), 0.7))
-    both = replace(
-        first, betas=torch.cat([first.betas, second.betas]),
-        global_orient=torch.zeros(2, 3), transl=torch.zeros(2, 3),
-        body_pose=torch.cat([first.body_pose, second.body_pose]),
-    )  # fmt: skip
-    together = open_body().posed(both)[0]
-    alone = torch.cat([open_body().posed(first)[0], open_body().posed(second)[0]])
-    torch.testing.assert_close(together, alone, atol=1e-6, rtol=0)
-
-
 def test_shape_coefficients_make_people_and_stay_closed():
     model = open_body()
     for axis in range(10):

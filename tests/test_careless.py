@@ -13,6 +13,8 @@ from PIL import Image
 
 from mover.app.cli import run_command
 from mover.core.errors import InputError
+from mover.core.types import Masks
+from mover.geometry.rle import decode
 from mover.io.capture.camera_file import path_of
 from mover.io.capture.folder import read_capture
 from mover.io.capture.parts import UNKNOWN
@@ -35,7 +37,9 @@ ROWS = {  # a chair of x 10 to 30 and y 8 to 40, or its box, as tools write it
 def test_rows_of_other_tools_are_read(tool: str, tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(json.dumps(ROWS[tool]))
     (found,) = read_things(tmp_path / "a.json", {}, SIZE).items
-    assert found.mask is not None
+    mask = decode(Masks(*SIZE[::-1], (found.mask,)), 0)
+    assert mask[8:40, 10:30].all()
+    assert mask.sum() == 20 * 32
     assert found.box == pytest.approx((10, 8, 30, 40))
     assert found.category == ("chair" if tool == "ultralytics" else UNKNOWN)
 
@@ -57,7 +61,19 @@ MASKS: dict[str, tuple[Any, str]] = {  # what a file or the only file of a folde
     "photo.jpg": (photo, "values, as a photo, expected a mask"),
     "a.png": (HEIC, "HEIC"),
     "v.png": (b"\0\0\0\x18ftypmp42", "a video: save one of its frames"),
-}
+    "studio.json": ([{"id": 1, "annotations": [{"result": []}], "data": {"image": "a"}}],
+                    "Label Studio's JSON, expected its export as COCO"),
+    "mini.json": ([{"image": "a.jpg", "id": 1, "tag": [], "annotation_id": 3}],
+                  "Label Studio's JSON"),
+    "guess.json": ([{"data": {"image": "a"}, "predictions": []}], "Label Studio's JSON"),
+    "v7.json": ({"videos": [], "annotations": []}, "expected COCO's 'images' and 'annotations'"),
+    "via.json": ({"a.jpg1": {"filename": "a.jpg", "regions": []}}, "project of VIA"),
+    "rows.json": ([{"image": "a.jpg", "id": 7}], r"\[0\].*bbox, segmentation or mask"),
+    "cvat.xml": (b"<?xml?><annotations><version>1.1</version></annotations>", "CVAT's XML"),
+    "voc.xml": (b"<annotation><object/></annotation>", "an XML of Pascal VOC"),
+    "yolo.txt": (b"56 0.31 0.6 0.2 0.4", "YOLO's text"),
+    "masks.zip": (b"PK", "unpack it"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", MASKS)
@@ -156,9 +172,7 @@ BODIES: list[tuple[Callable[[np.ndarray], np.ndarray], str]] = [
 
 
 @pytest.mark.parametrize(("change", "words"), BODIES)
-def test_bodies_of_another_unit_or_frame_are_named(
-    change: Callable[[np.ndarray], np.ndarray], words: str, folder: Path
-) -> None:
+def test_bodies_of_another_unit_or_frame_are_named(change, words, folder):
     arrays = tiny.bodies()
     verts = arrays["vertices"]
     size = np.linalg.norm(verts.max(1) - verts.min(1), axis=1).mean()
@@ -206,9 +220,7 @@ def test_poses_under_which_people_move_too_much_are_named(words: str) -> None:
     assert all(words in text for text in said)
 
 
-def test_a_capture_is_no_result_and_a_file_no_capture(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_capture_is_no_result_and_a_file_no_capture(folder, capsys):
     for command, words in (
         (["export", str(folder), "--to", "glb"], "is a capture, expected a result"),
         (["evaluate", str(folder), "--truth", str(folder)], "is a capture, expected a result"),
@@ -219,9 +231,7 @@ def test_a_capture_is_no_result_and_a_file_no_capture(
         assert words in capsys.readouterr().err
 
 
-def test_keypoints_of_another_size_of_the_video_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_keypoints_of_another_size_of_the_video_are_refused(tmp_path, capsys):
     points = np.random.default_rng(0).uniform([300, 100], [1200, 700], (4, 25, 2))
     np.savez(tmp_path / "k.npz", layout=np.array("openpose25"), frame=np.arange(4),
              person=np.zeros(4, int), points=points, confidence=np.ones((4, 25)))  # fmt: skip

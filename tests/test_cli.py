@@ -80,17 +80,14 @@ def test_ctrl_c_ends_a_run_whose_library_swallows_it():
     assert said == "\nmover run: stopped; the same command goes on from here\n"
 
 
-@pytest.mark.parametrize(
-    ("body", "said", "code"),
-    [
-        ("raise MemoryError", "mover run: out of memory; what was finished is kept\n", 2),
-        (
-            "raise RuntimeError('[enforce fail at alloc_cpu.cpp:127]')",
-            "mover run: out of memory; what was finished is kept\n", 2,
-        ),
-        ("cli.say('out'), cli.say('ü', sys.stderr)", "\\xfc\n", 0),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("body", "said", "code"), [
+    ("raise MemoryError", "mover run: out of memory; what was finished is kept\n", 2),
+    (
+        "raise RuntimeError('[enforce fail at alloc_cpu.cpp:127]')",
+        "mover run: out of memory; what was finished is kept\n", 2,
+    ),
+    ("cli.say('out'), cli.say('ü', sys.stderr)", "\\xfc\n", 0),
+])  # fmt: skip
 def test_no_memory_a_closed_output_and_old_letters_are_no_traceback(body, said, code):
     words = " ".join(map(shlex.quote, command_that(body))) + " >&-"
     env = {**os.environ, "PYTHONIOENCODING": "ascii"}
@@ -120,17 +117,14 @@ def test_run_has_few_flags_and_the_first_screen_shows_those_that_people_use(caps
     assert "--place.weights.depth" in shown["--help-all"]
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["run", "capture", "--preset", "best"], "paper, robust"),
-        (["run", "capture", "--format", "nope"], "--format: 'nope' is none of folder, total3d"),
-        (["check", "capture", "--format", "nope"], "--format: 'nope' is none of folder, total3d"),
-        (["run", "nowhere"], "nowhere"),
-        (["fit", "x", "--preset", "best"], "robust, paper"),
-        (["import-bodies", "nope", "x"], "TOOL: 'nope' is none of"),
-    ],
-)
+@pytest.mark.parametrize(("words", "said"), [
+    (["run", "capture", "--preset", "best"], "paper, robust"),
+    (["run", "capture", "--format", "nope"], "--format: 'nope' is none of folder, total3d"),
+    (["check", "capture", "--format", "nope"], "--format: 'nope' is none of folder, total3d"),
+    (["run", "nowhere"], "nowhere"),
+    (["fit", "x", "--preset", "best"], "robust, paper"),
+    (["import-bodies", "nope", "x"], "TOOL: 'nope' is none of"),
+])  # fmt: skip
 def test_a_wrong_name_is_answered_with_the_known_ones(words, said, capsys):
     assert cli.run_command(words[0], words[1:]) == 2
     assert said in capsys.readouterr().err
@@ -240,9 +234,7 @@ def test_help_and_mistyped_names_of_every_command_import_nothing_heavy():
 
 
 @pytest.mark.parametrize("name", ["experiment", "paper-table"])
-def test_commands_of_the_bench_say_where_it_is_if_it_is_not_installed(
-    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_commands_of_the_bench_say_where_it_is_if_it_is_not_installed(name, monkeypatch, capsys):
     def absent(module: str) -> None:
         top = module.partition(".")[0]
         raise ModuleNotFoundError(f"No module named {top!r}", name=top)  # as Python does

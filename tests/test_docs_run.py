@@ -90,7 +90,6 @@ def start(words: list[str]) -> subprocess.Popen[str]:
 def look_and_leave(words: list[str]) -> None:
     """Open the viewer's page once, then press Ctrl-C."""
     server = start([*words, "--port", "18080"])
-    assert server.stdout is not None
     said = server.stdout.readline()
     assert said.startswith("http://127.0.0.1:"), said + server.communicate()[1]
     with urllib.request.urlopen(said.split()[0], timeout=60) as page:

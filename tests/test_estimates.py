@@ -15,15 +15,12 @@ from mover.pipeline.estimates import lens_and_scale, odd_sizes, odd_statures, po
 CAMERA = little_room.camera()  # 400 px, 640 px wide: 77 degrees
 
 
-@pytest.mark.parametrize(
-    ("lens", "size", "said", "cures"),
-    [
-        (0.01, 0.02, ("400 px, 77° across, ± 1.0 %", "± 2.0 %"), (False, False)),
-        (0.064, 0.06, ("± 6.4 %", "± 6.0 %"), (True, True)),
-        (None, 0.0, ("not stated", "size of the people or"), (False, False)),
-        (0.03, None, ("± 3.0 %", "no people"), (True, False)),
-    ],
-)
+@pytest.mark.parametrize(("lens", "size", "said", "cures"), [
+    (0.01, 0.02, ("400 px, 77° across, ± 1.0 %", "± 2.0 %"), (False, False)),
+    (0.064, 0.06, ("± 6.4 %", "± 6.0 %"), (True, True)),
+    (None, 0.0, ("not stated", "size of the people or"), (False, False)),
+    (0.03, None, ("± 3.0 %", "no people"), (True, False)),
+])  # fmt: skip
 def test_lens_and_scale_have_their_spreads_and_a_cure_where_they_are_loose(lens, size, said, cures):
     found = lens_and_scale(CAMERA, lens, size)
     for line, text, cure, way in zip(
@@ -57,16 +54,13 @@ def test_only_a_stature_beyond_the_population_is_named():
         assert all(f"person 1 is {tall:.2f} m tall" in one and "--height" in one for one in found)
 
 
-@pytest.mark.parametrize(
-    ("category", "size", "said"),
-    [
-        ("bed", (1.6, 0.5, 2.1), ""),
-        ("bed", (2.0, 0.5, 3.2), "3.20 m deep"),
-        ("dining table", (1.2, 0.42, 0.8), ""),  # COCO calls coffee tables so, too
-        ("desk", (1.2, 0.42, 0.7), "0.42 m high"),
-        ("statue", (9.0, 9.0, 9.0), ""),
-    ],
-)
+@pytest.mark.parametrize(("category", "size", "said"), [
+    ("bed", (1.6, 0.5, 2.1), ""),
+    ("bed", (2.0, 0.5, 3.2), "3.20 m deep"),
+    ("dining table", (1.2, 0.42, 0.8), ""),  # COCO calls coffee tables so, too
+    ("desk", (1.2, 0.42, 0.7), "0.42 m high"),
+    ("statue", (9.0, 9.0, 9.0), ""),
+])  # fmt: skip
 def test_only_a_size_beyond_the_standard_of_its_class_is_named(category, size, said):
     mesh = little_room.box(*size)
     item = replace(little_room.piece("it", mesh, (0.0, -3.0), 0.4, -1.5), category=category)
@@ -78,7 +72,6 @@ def test_only_a_size_beyond_the_standard_of_its_class_is_named(category, size, s
 def test_a_fit_that_misses_by_more_than_a_fortieth_of_the_height_is_named():
     bodies = standing(1.0)
     away = torch.tensor([0.0, 0.0, 4.0])
-    assert bodies.joints is not None
     bodies = replace(bodies, verts=bodies.verts + away, joints=bodies.joints + away, space="camera")
     high = 400 * 1.68 / 4  # [px] of an adult 4 m away
     (found,) = poor_fits(bodies, high * torch.tensor([0.02, 0.04]), CAMERA)

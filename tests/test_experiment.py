@@ -135,9 +135,7 @@ def patched() -> Iterator[pytest.MonkeyPatch]:
 
 
 @pytest.fixture(scope="module")
-def finished(
-    tmp_path_factory: pytest.TempPathFactory, patched: pytest.MonkeyPatch
-) -> tuple[ExperimentArgs, list[Step], Here]:
+def finished(tmp_path_factory, patched):
     """Two rooms, three variants."""
     del patched
     out = tmp_path_factory.mktemp("out")
@@ -220,9 +218,7 @@ def test_the_page_has_the_means_and_differences_of_the_files(finished) -> None:
     assert "mover experiment --set rooms --seeds 0,1 --variants robust paper no-people" in page
 
 
-def test_stages_share_a_camera_and_people_who_are_withheld_are_measured_all_the_same(
-    finished,
-) -> None:
+def test_stages_share_a_camera_and_people_who_are_withheld_are_measured_all_the_same(finished):
     paper, alone = (
         json.loads((finished[0].out / "rooms" / "0" / f"{name}.json").read_text())
         for name in ("paper", "no-people")
@@ -234,9 +230,7 @@ def test_stages_share_a_camera_and_people_who_are_withheld_are_measured_all_the_
     assert "contact_f1" in alone["full"]
 
 
-def test_a_variant_that_fails_is_named_and_done_again_by_the_next_pass(
-    patched, tmp_path: Path
-) -> None:
+def test_a_variant_that_fails_is_named_and_done_again_by_the_next_pass(patched, tmp_path):
     args = ExperimentArgs("0", ("robust", "paper"), tmp_path)
     with patched.context() as patch:
         good = job.measured
@@ -302,15 +296,12 @@ class TestPool:
         ended.close()  # returns at once only if the minute is not waited for
 
 
-@pytest.mark.parametrize(
-    ("flags", "said"),
-    [
-        (["--set", "flats"], "--set: 'flats' is none of mini, rooms"),
-        (["--variants", "best"], "--variants: 'best' is none of ablation, terms"),
-        (["--seeds", "x"], "--seeds: 'x'"),
-        (["--workers", "-1"], "--workers: has -1, expected a whole number from 0 to"),
-    ],
-)
+@pytest.mark.parametrize(("flags", "said"), [
+    (["--set", "flats"], "--set: 'flats' is none of mini, rooms"),
+    (["--variants", "best"], "--variants: 'best' is none of ablation, terms"),
+    (["--seeds", "x"], "--seeds: 'x'"),
+    (["--workers", "-1"], "--workers: has -1, expected a whole number from 0 to"),
+])  # fmt: skip
 def test_the_command_names_what_it_does_not_know(flags, said, tmp_path, capsys) -> None:
     assert run_command("experiment", [*flags, "--out", str(tmp_path)]) == 2
     assert said in capsys.readouterr().err

@@ -265,17 +265,13 @@ class TestOverlapAndHeight:
         factor = pytest.approx(0.97 + NEAR * max(0, misfit - BENT))
         assert found == (factor, pytest.approx(spread), ())
 
-    @pytest.mark.parametrize(
-        "heights",
-        [
-            None,
-            Extents(0.97, 0.001, QUICK.least - 1),
-            Extents(1 + 1.01 * QUICK.span, 0.001, 9),
-            Extents(1 - 1.01 * QUICK.span, 0.001, 9),
-            Extents(0.97, QUICK.spread, 9),
-        ],
-        ids=("none", "few", "far", "near", "uncertain"),
-    )
+    @pytest.mark.parametrize("heights", [
+        None,
+        Extents(0.97, 0.001, QUICK.least - 1),
+        Extents(1 + 1.01 * QUICK.span, 0.001, 9),
+        Extents(1 - 1.01 * QUICK.span, 0.001, 9),
+        Extents(0.97, QUICK.spread, 9),
+    ], ids=("none", "few", "far", "near", "uncertain"))  # fmt: skip
     def test_heights_that_say_too_little_change_nothing(self, monkeypatch, heights):
         factor, spread, warnings = self.observed(monkeypatch, Peak(1.02, 0.004, 0.1), heights)
         assert (factor, spread) == (pytest.approx(1.02), pytest.approx(math.hypot(0.004, COMMON)))

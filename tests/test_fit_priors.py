@@ -15,26 +15,17 @@ from mover.bodies.skinning import growth_of, open_body
 from mover.core.types import Bodies
 from mover.energy.body_terms import BODY_TERMS, SIGMA_HELD, deviation_term, robust_square
 from mover.evaluate.bodies import procrustes
-from mover.fitting import ground
+from mover.fitting import ground, priors
 from mover.fitting.bodies import FitInputs, fit_bodies
 from mover.fitting.config import STAGES, FitConfig, Stage
 from mover.fitting.energy import HEIGHT, UPPER, Seen
 from mover.fitting.noise import FEW, at_most, bias_of, noise_of, without
-from mover.fitting.priors import (
-    HIPS,
-    KNEES,
-    excess_of,
-    limit_table,
-    off_pose,
-    resting,
-    spreads,
-)
 from mover.fitting.start import BACK, LEGS, lying_guesses, turned_round, upright_guesses
 from mover.fitting.tracks import CALM, joint_speed, motion_of, stages_of
 from mover.fitting.unknowns import NO_FLOOR, Frame, Unknowns, floor_of, rig_of
 from mover.geometry.rotations import axis_angle, rot_x, rot_y, rot_z, rotation_vectors
 
-REST = resting(1, torch.zeros(1))
+REST = priors.resting(1, torch.zeros(1))
 UP = torch.tensor([0.0, -1.0, 0.0])
 
 
@@ -116,14 +107,14 @@ def test_limbs_that_look_still_are_held_and_no_others():
 
 
 def test_an_ankle_that_levels_the_foot_costs_no_more_than_one_at_rest():
-    rest, spread = REST, spreads(1, REST)
+    rest, spread = REST, priors.spreads(1, REST)
     bent, level = rest.clone(), rest.clone()
     for joint, turn in (("left_hip", -0.7), ("left_knee", 1.0)):
         column = 3 * (BODY.index(joint) - 1)
         bent[0, column] += turn
         level[0, column] += turn
     level[0, 3 * (BODY.index("left_ankle") - 1)] -= 0.3
-    costs = [deviation_term(off_pose(pose, REST), spread) for pose in (rest, bent, level)]
+    costs = [deviation_term(priors.off_pose(pose, REST), spread) for pose in (rest, bent, level)]
     assert float(costs[0]) == 0
     assert float(costs[1] - costs[2]) == pytest.approx((0.3 / math.radians(14)) ** 2)
 
@@ -176,7 +167,7 @@ def test_a_leaning_floor_lies_where_its_soles_are():
 
 def test_upright_bodies_are_symmetric_and_nearly_straight_where_they_stand():
     poses = torch.stack([guess.pose for guess in upright_guesses(torch.zeros(1))[::4]])
-    assert not excess_of(poses).any()
+    assert not priors.excess_of(poses).any()
     mirrored = poses.unflatten(-1, (21, 3)) * torch.tensor([1.0, -1.0, -1.0])
     other = [name.replace("left", "+").replace("right", "left").replace("+", "right")
              for name in BODY[1:]]  # fmt: skip
@@ -189,14 +180,14 @@ def test_upright_bodies_are_symmetric_and_nearly_straight_where_they_stand():
 
 def test_only_lying_people_have_arms_anywhere_in_their_ranges():
     like = torch.zeros(1, dtype=torch.float64)
-    usual, generator = spreads(1, like)[0], np.random.default_rng(0)
-    low, high = (x.numpy() for x in limit_table()[:2])
+    usual, generator = priors.spreads(1, like)[0], np.random.default_rng(0)
+    low, high = (x.numpy() for x in priors.limit_table()[:2])
     drawn = generator.uniform(low, high, (200_000, 63)).std(0)
     arms = torch.tensor(["shoulder" in name for name in BODY[1:]]).repeat_interleave(3)
     for guess in lying_guesses(like, BACK):
         np.testing.assert_allclose(guess.spread[arms], drawn[arms.numpy()], rtol=0.01)
         assert torch.equal(guess.spread[~arms], usual[~arms])
-    usual[[*HIPS, *KNEES]] = LEGS
+    usual[[*priors.HIPS, *priors.KNEES]] = LEGS
     assert all(torch.equal(guess.spread, usual) for guess in upright_guesses(like))
 
 
@@ -254,10 +245,10 @@ LEFT = 0.45
 
 def looked_at(weight):
     none = torch.zeros(len(weight), weight.shape[1], 2)
-    rest = resting(len(weight), none)
+    rest = priors.resting(len(weight), none)
     return Seen(
         none, weight, torch.eye(3), 540, torch.tensor([0.0, -1, 0]), None, rest,
-        spreads(len(weight), none),
+        priors.spreads(len(weight), none),
     )  # fmt: skip
 
 

@@ -245,26 +245,6 @@ def test_of_many_images_only_ours_counts_and_this_is_said(tmp_path):
         read_things(path, {}, (W, H), "x.png")
 
 
-@pytest.mark.parametrize(("name", "content", "words"), [
-    ("a.json", [{"id": 1, "annotations": [{"result": []}], "data": {"image": "a"}}],
-     "Label Studio's JSON, expected its export as COCO"),
-    ("a.json", [{"image": "a.jpg", "id": 1, "tag": [], "annotation_id": 3}], "Label Studio's JSON"),
-    ("a.json", [{"data": {"image": "a"}, "predictions": []}], "Label Studio's JSON"),
-    ("a.json", {"videos": [], "annotations": []}, "expected COCO's 'images' and 'annotations'"),
-    ("a.json", {"a.jpg1": {"filename": "a.jpg", "regions": []}}, "project of VIA"),
-    ("a.json", [{"image": "a.jpg", "id": 7}], r"\[0\].*bbox, segmentation or mask"),
-    ("a.xml", "<?xml?><annotations><version>1.1</version></annotations>", "CVAT's XML"),
-    ("a.xml", "<annotation><object/></annotation>", "an XML of Pascal VOC"),
-    ("a.txt", "56 0.31 0.6 0.2 0.4", "YOLO's text"),
-    ("a.zip", "PK", "unpack it"),
-])  # fmt: skip
-def test_what_is_not_read_is_named_with_its_export(name, content, words, tmp_path):
-    text = content if isinstance(content, str) else json.dumps(content)
-    (tmp_path / name).write_text(text)
-    with pytest.raises(InputError, match=words):
-        read_things(tmp_path / name, {}, (W, H))
-
-
 def chair(folder: Path, drawn: Any, **more: Any) -> Instances:
     row = {"id": 1, "image_id": 0, "category_id": 1, "segmentation": drawn, **more}
     tree = {"images": [{"id": 0, "width": W, "height": H}], "annotations": [row],

@@ -33,9 +33,7 @@ def solid(name: str, style: int, seed: int = 0) -> tuple[trimesh.Trimesh, Furnit
 
 
 @pytest.mark.parametrize(("name", "style"), ALL)
-def test_a_piece_is_one_closed_body_on_its_base_of_usual_size_and_drawn_from_its_seed(
-    name: str, style: int
-) -> None:
+def test_a_piece_is_one_closed_body_on_its_base_of_usual_size_and_drawn_from_its_seed(name, style):
     ranges, found = np.array(SIZES[canonical(name)]), []
     for seed in range(5):
         mesh, piece = solid(name, style, seed)

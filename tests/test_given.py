@@ -205,16 +205,13 @@ def test_standard_sizes_pull_what_they_know_and_leave_the_rest() -> None:
     assert float(best[2].abs().max()) < 1e-4
 
 
-@pytest.mark.parametrize(
-    ("category", "size", "expected"),
-    [
-        ("table", (1.1, 0.43, 0.6), 0.42),  # a coffee table, which detectors call a dining table
-        ("table", (1.1, 0.65, 0.6), 0.74),
-        ("table", (1.1, 0.20, 0.6), None),  # neither
-        ("sofa", (1.7, 1.40, 0.9), None),
-        ("cabinet", (1.1, 0.8, 0.6), None),  # has no other name, and no standard height
-    ],
-)
+@pytest.mark.parametrize(("category", "size", "expected"), [
+    ("table", (1.1, 0.43, 0.6), 0.42),  # a coffee table, which detectors call a dining table
+    ("table", (1.1, 0.65, 0.6), 0.74),
+    ("table", (1.1, 0.20, 0.6), None),  # neither
+    ("sofa", (1.7, 1.40, 0.9), None),
+    ("cabinet", (1.1, 0.8, 0.6), None),  # has no other name, and no standard height
+])  # fmt: skip
 def test_the_standard_of_another_class_of_the_same_name_counts_where_its_own_is_contradicted(
     category: str, size: tuple[float, float, float], expected: float | None
 ) -> None:
@@ -282,20 +279,17 @@ CUTS = {known: [[known if s == cut else SEEN for s in range(4)] for cut in range
         for known in (LEAST, LIKELY)}  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("sides", "fits"),
-    [
-        ([SEEN, LIKELY, SEEN, LIKELY], [LEAST] * 4),
-        ([UNKNOWN] * 4, [UNKNOWN] * 4),
-        ([SEEN] * 4, [SEEN] * 4),
-        ([SEEN, LEAST, LIKELY, UNKNOWN], [LEAST, LEAST, LEAST, UNKNOWN]),
-        *(
-            (CUTS[known][cut], [SEEN if s == (cut + 2) % 4 else LEAST for s in range(4)])
-            for cut in range(4)
-            for known in (LEAST, LIKELY)
-        ),
-    ],
-)
+@pytest.mark.parametrize(("sides", "fits"), [
+    ([SEEN, LIKELY, SEEN, LIKELY], [LEAST] * 4),
+    ([UNKNOWN] * 4, [UNKNOWN] * 4),
+    ([SEEN] * 4, [SEEN] * 4),
+    ([SEEN, LEAST, LIKELY, UNKNOWN], [LEAST, LEAST, LEAST, UNKNOWN]),
+    *(
+        (CUTS[known][cut], [SEEN if s == (cut + 2) % 4 else LEAST for s in range(4)])
+        for cut in range(4)
+        for known in (LEAST, LIKELY)
+    ),
+])  # fmt: skip
 def test_sides_that_may_be_hidden_and_those_beside_them_bound_nothing_of_a_shape_that_fits(
     sides: list[int], fits: list[int]
 ) -> None:

@@ -66,18 +66,13 @@ def test_hypotheses_of_another_scene_are_left_out_and_reported(capture: Capture,
     assert [w for w in found.warnings if "not of this scene" in w and "chair_0" in w]
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"format": "x"}, "format"),
-        ({"objects": []}, "objects"),
-        ({"objects": {"chair_0": [{}] * 17}}, "at most 16"),
-        ({"objects": {"chair_0": [{"translation": [0, 0], "yaw": 0}]}}, "translation"),
-    ],
-)
-def test_wrong_fields_are_refused_by_name(
-    capture: Capture, tmp_path: Path, change: dict[str, object], words: str
-):
+@pytest.mark.parametrize(("change", "words"), [
+    ({"format": "x"}, "format"),
+    ({"objects": []}, "objects"),
+    ({"objects": {"chair_0": [{}] * 17}}, "at most 16"),
+    ({"objects": {"chair_0": [{"translation": [0, 0], "yaw": 0}]}}, "translation"),
+])  # fmt: skip
+def test_wrong_fields_are_refused_by_name(capture, tmp_path, change, words):
     write_capture(with_others(capture), tmp_path / "out")
     file = tmp_path / "out" / "hypotheses.json"
     file.write_text(json.dumps({**json.loads(file.read_text()), **change}))
@@ -134,9 +129,7 @@ class Stopping(Run):
 
 
 @pytest.mark.parametrize(("preset", "count"), [("robust", 3), ("paper", 1)])
-def test_the_main_job_starts_from_all_of_them(
-    capture: Capture, tmp_path: Path, preset: str, count: int
-):
+def test_the_main_job_starts_from_all_of_them(capture, tmp_path, preset, count):
     """The paper has one start; ours takes all, each on the floor."""
     given = replace(with_others(capture), bodies=None, people=None, touch=None)
     with pytest.raises(StoppedError) as stopped:

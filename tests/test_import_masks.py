@@ -49,7 +49,6 @@ def drawn() -> np.ndarray:
 
 
 def drawn_of(item: Instance, height: int = 48, width: int = 64) -> np.ndarray:
-    assert item.mask is not None
     return decode(Masks(height, width, (item.mask,)), 0).numpy()
 
 
@@ -63,17 +62,6 @@ def test_every_layout_gives_the_same_masks(tmp_path, kind):
     assert set(got) == {m.tobytes() for m in masks}
     words = [got[m.tobytes()] for m in masks]
     assert words == (["object"] * 4 if kind in NAMELESS else WORDS)
-
-
-def test_polygons_fill_what_they_surround(tmp_path):
-    row = {"id": 1, "image_id": 1, "category_id": 1, "bbox": [10, 10, 20, 15],
-           "segmentation": [[10, 10, 30, 10, 30, 25, 10, 25]]}  # fmt: skip
-    tree = {"images": [{"id": 1, "width": 64, "height": 48}], "annotations": [row],
-            "categories": [{"id": 1, "name": "bed"}]}  # fmt: skip
-    (tmp_path / "a.json").write_text(json.dumps(tree))
-    mask = drawn_of(read_instances(tmp_path / "a.json", {}, None).items[0])
-    assert mask[10:25, 10:30].all()
-    assert mask.sum() == 300
 
 
 def test_shapes_of_labelme_are_filled_and_those_of_a_group_are_one(tmp_path):

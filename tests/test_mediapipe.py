@@ -17,17 +17,6 @@ from mover.core.types import Masks
 from mover.geometry.rle import decode, encode
 from mover.perceive import mediapipe, needs
 from mover.perceive.config import FramesConfig, ModelsConfig
-from mover.perceive.mediapipe import (
-    PoseInputs,
-    Poses,
-    detected,
-    find_poses,
-    people_in,
-    pose_inputs,
-    refined,
-    without_furniture,
-    without_room,
-)
 from mover.perceive.reference import Clean
 from mover.perceive.video import Clip, read_frames, write_jpeg
 
@@ -86,15 +75,13 @@ def crowd(*people: tuple[float, float]) -> np.ndarray:
     return picture
 
 
-def test_several_people_are_found_upright_in_the_pixels_of_the_picture(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_several_people_are_found_upright_in_the_pixels_of_the_picture(tmp_path, monkeypatch):
     one, two = PEOPLE
     for k, people in enumerate([(one, two), (two,), (), (one, two)]):
         write_jpeg(crowd(*people), tmp_path / f"{k:06d}.jpg")
     monkeypatch.setattr(mediapipe, "loaded", {"d": detector, "l": landmarks}.__getitem__)
     clip = Clip(str(tmp_path), W, H, torch.arange(4) / 5, 5.0)
-    found = find_poses(PoseInputs(clip, ("d", "l"), ""))
+    found = mediapipe.find_poses(mediapipe.PoseInputs(clip, ("d", "l"), ""))
     assert found.frame.tolist() == [0, 0, 1, 3, 3]
     middle = found.points[:, 5]
     names = {one: 0, two: 1} if float(middle[0, 0]) < 160 else {one: 1, two: 0}
@@ -125,15 +112,15 @@ def test_masks_lose_the_furniture_that_no_limb_is_near_to():
     body = ((x - 160).abs() < 10) & (y > 10) & (y < 228)
     chair = (x > 150) & (x < 260) & (y > 130) & (y < 220)
     masks = Masks(H, W, (encode(body | chair | ((x > 280) & (y > 200))),))
-    poses = Poses(
+    poses = mediapipe.Poses(
         masks, torch.from_numpy(points).float(), torch.ones(1, 33), torch.tensor([0]),
         torch.tensor([0]),
     )  # fmt: skip
-    found = decode(without_furniture(poses, chair).masks, 0)
+    found = decode(mediapipe.without_furniture(poses, chair).masks, 0)
     assert bool((found & body).sum() == body.sum())  # what is near to a limb stays
     assert not bool(found[:, 200:260].any())  # of the chair nothing else
     assert bool(found[220, 300])  # what is no furniture stays
-    none = without_furniture(poses, torch.zeros(H, W, dtype=torch.bool))
+    none = mediapipe.without_furniture(poses, torch.zeros(H, W, dtype=torch.bool))
     assert none.masks.counts == masks.counts
 
 
@@ -152,7 +139,7 @@ def test_landmarks_where_a_frame_shows_the_empty_room_are_not_seen(tmp_path: Pat
         [[215.0, 150], [215, 200], [232, 197], [290, 225]]
     )
     points[0, 1] = torch.tensor([-20.0, 50])  # outside nothing is known
-    poses = Poses(
+    poses = mediapipe.Poses(
         Masks(H, W, (encode(torch.ones(H, W, dtype=torch.bool)),)), points, torch.ones(1, 33),
         torch.tensor([0]), torch.tensor([0]),
     )  # fmt: skip
@@ -161,20 +148,24 @@ def test_landmarks_where_a_frame_shows_the_empty_room_are_not_seen(tmp_path: Pat
     chair[130:220, 200:260] = True
     clean = Clean(torch.from_numpy(room).float() / 255, chair)  # always under the man's mask
     for furniture, gone in ((chair, [25, 27, 31]), (None, [31])):
-        found = without_room(poses, clip, clean, furniture)
+        found = mediapipe.without_room(poses, clip, clean, furniture)
         assert (found.confidence[0] == 0).nonzero()[:, 0].tolist() == gone
     shown = Clean(torch.from_numpy(frame).float() / 255, torch.zeros_like(chair))
-    assert torch.equal(without_room(poses, clip, shown, chair).confidence, poses.confidence)
+    assert torch.equal(
+        mediapipe.without_room(poses, clip, shown, chair).confidence, poses.confidence
+    )
 
 
 def test_nothing_is_found_in_an_empty_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     write_jpeg(crowd(), tmp_path / "000000.jpg")
     monkeypatch.setattr(mediapipe, "loaded", {"d": detector, "l": landmarks}.__getitem__)
     clip = Clip(str(tmp_path), W, H, torch.zeros(1), 5.0)
-    found = find_poses(PoseInputs(clip, ("d", "l"), ""))
+    found = mediapipe.find_poses(mediapipe.PoseInputs(clip, ("d", "l"), ""))
     assert found.points.shape == (0, 33, 2)
-    assert detected(crowd(), detector) == []
-    assert np.array_equal(refined(np.full((39, 2), -9.0), np.zeros((64, 64, 39)))[0], [-9, -9])
+    assert mediapipe.detected(crowd(), detector) == []
+    assert np.array_equal(
+        mediapipe.refined(np.full((39, 2), -9.0), np.zeros((64, 64, 39)))[0], [-9, -9]
+    )
 
 
 def test_the_layout_names_what_the_body_model_has():
@@ -216,18 +207,13 @@ class TestWeights:
             needs.fetch(print, source)
             assert (needs.folder() / needs.LANDMARKS).read_bytes()[-1:] == last
 
-    @pytest.mark.parametrize(
-        ("name", "content", "words"),
-        [
-            ("m.whl", b"PK", "cannot be read"),
-            ("m.whl", None, "is not that of mediapipe==0.10.21"),
-            ("m.task", None, "cannot be read"),
-            ("m.tflite", b"nonsense", "no network of TensorFlow Lite"),
-        ],
-    )
-    def test_what_is_no_network_is_refused(
-        self, name: str, content: bytes | None, words: str, tmp_path: Path
-    ):
+    @pytest.mark.parametrize(("name", "content", "words"), [
+        ("m.whl", b"PK", "cannot be read"),
+        ("m.whl", None, "is not that of mediapipe==0.10.21"),
+        ("m.task", None, "cannot be read"),
+        ("m.tflite", b"nonsense", "no network of TensorFlow Lite"),
+    ])  # fmt: skip
+    def test_what_is_no_network_is_refused(self, name, content, words, tmp_path):
         path = tmp_path / name
         if content is None:
             self.archive(path, dict.fromkeys(needs.IN_WHEEL, b"\0\0\0\0TFL3other"))
@@ -254,7 +240,7 @@ class TestWeights:
         assert all("mediapipe" in line for line in found)
         assert not any("mediapipe" in line for line in needs.missing(ModelsConfig()))
         with pytest.raises(InputError, match="mover weights mediapipe"):
-            pose_inputs(Clip("", 1, 1, torch.zeros(1), None))
+            mediapipe.pose_inputs(Clip("", 1, 1, torch.zeros(1), None))
 
 
 @pytest.mark.slow
@@ -270,7 +256,7 @@ def test_joints_and_masks_are_those_of_mediapipe(name: str):
         if index not in wanted:
             continue
         row, picture = wanted.index(index), pixels()
-        found = people_in(picture, *nets)
+        found = mediapipe.people_in(picture, *nets)
         off = [np.linalg.norm(p - stored["points33"][row], axis=1).mean() for p, *_ in found]
         misses.append(min(off) / np.ptp(stored["points33"][row], axis=0).max())
         mask, size = found[int(np.argmin(off))][2], picture.shape[:2]

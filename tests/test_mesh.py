@@ -15,7 +15,6 @@ from mover.core.types import Mesh
 from mover.geometry import mesh as m
 from mover.geometry.mesh import coarser, farthest_first
 from mover.geometry.nearest import nearest_points, to_surface
-from mover.geometry.rotations import axis_angle
 from mover.geometry.topology import manifold
 
 
@@ -74,17 +73,6 @@ def test_a_surface_is_closed_only_if_each_edge_has_two_opposite_faces():
     assert not m.is_closed(torch.cat([faces, torch.zeros(1, 3, dtype=torch.long)]))
     assert not m.is_closed(faces[:0])
     assert not m.is_closed(two_cubes_on_one_edge().faces)
-
-
-def test_normals_of_a_sphere_point_away_from_its_centre_and_turn_with_it():
-    mesh = sphere(4)
-    normals = m.vertex_normals(mesh.verts, mesh.faces)
-    assert (normals * mesh.verts).sum(-1).min() > 0.999
-    turns = axis_angle(torch.tensor([[0.3, -1.0, 0.2], [2.0, 0.1, 0.5]]).double())
-    turned = mesh.verts @ turns.mT
-    expected = m.face_normals(mesh.verts, mesh.faces) @ turns.mT
-    torch.testing.assert_close(m.face_normals(turned, mesh.faces), expected)
-    torch.testing.assert_close(m.vertex_normals(turned, mesh.faces), normals @ turns.mT)
 
 
 def test_vertex_normals_are_the_area_weighted_sum_of_a_naive_loop():

@@ -91,25 +91,19 @@ def test_soles_under_the_floor_are_counted_and_measured():
         assert errors.ground_penetration_distance(standing) == pytest.approx(depth)
 
 
-def test_procrustes_undoes_every_similarity_but_no_mirror():
-    rng = np.random.default_rng(1)
-    points = torch.tensor(rng.normal(size=(5, 30, 3)))
-    turns = torch.tensor(Rotation.random(5, rng).as_matrix())
-    scale = torch.tensor(rng.uniform(0.3, 3, (5, 1, 1)))
-    target = scale * points @ turns.mT + torch.tensor(rng.normal(size=(5, 1, 3)))
-    assert torch.allclose(errors.procrustes(points, target), target, atol=1e-12)
-    mirrored = target * torch.tensor([-1.0, 1, 1])
-    assert (errors.procrustes(points, mirrored) - mirrored).norm(dim=-1).mean() > 0.1
-
-
-def test_procrustes_finds_the_rotation_of_another_library_and_the_best_scale():
+@pytest.mark.parametrize("kind", ["unrelated", "similar", "mirrored"])
+def test_procrustes_finds_the_rotation_of_another_library_and_the_best_scale(kind):
     rng = np.random.default_rng(2)
     points, target = rng.normal(size=(2, 12, 3))
+    if kind != "unrelated":
+        turned = 2.5 * points @ Rotation.random(rng=rng).as_matrix().T + [0.3, -1.0, 2.0]
+        target = turned if kind == "similar" else turned * [-1.0, 1.0, 1.0]
     a, b = points - points.mean(0), target - target.mean(0)
     turn = Rotation.align_vectors(b, a)[0].as_matrix()
     scale = (b * (a @ turn.T)).sum() / (a**2).sum()
-    found = errors.procrustes(torch.tensor(points), torch.tensor(target))
-    assert np.allclose(found.numpy(), scale * a @ turn.T + target.mean(0))
+    found = errors.procrustes(torch.tensor(points), torch.tensor(target)).numpy()
+    assert np.allclose(found, scale * a @ turn.T + target.mean(0))
+    assert np.allclose(found, target) == (kind == "similar")
 
 
 def test_pose_errors_are_in_the_world_and_aligned_ones_are_not():

@@ -100,14 +100,10 @@ def test_people_before_an_object_do_not_move_it():
     assert stays(seen, people) == []
 
 
-@pytest.mark.parametrize(
-    ("chair", "bed", "people"),
-    [
-        ((patch(20, 40, 30, 30), patch(70, 40, 30, 30)), patch(15, 30, 90, 45), (None, ASIDE)),
-        ((patch(118, 40, 36, 48), patch(60, 20, 36, 68)), patch(15, 25, 80, 45), (ASIDE,)),
-    ],
-    ids=["hides and uncovers", "comes before it, which looks smaller"],
-)
+@pytest.mark.parametrize(("chair", "bed", "people"), [
+    ((patch(20, 40, 30, 30), patch(70, 40, 30, 30)), patch(15, 30, 90, 45), (None, ASIDE)),
+    ((patch(118, 40, 36, 48), patch(60, 20, 36, 68)), patch(15, 25, 80, 45), (ASIDE,)),
+], ids=["hides and uncovers", "comes before it, which looks smaller"])  # fmt: skip
 def test_what_a_moved_object_hides_stands_still(chair, bed, people):
     seen = [(f, 1, bed & ~chair[f >= 30]) for f in FRAMES]
     seen += [(f, 2, chair[f >= 30]) for f in FRAMES]
@@ -204,13 +200,11 @@ def test_a_capture_may_have_the_objects_masks_in_its_frames(tmp_path: Path):
     number = tiny.objects()["annotations"][0]["id"]
     (folder / "furniture.json").write_text(json.dumps(furniture(number)))
     capture = read_capture(folder)
-    assert capture.furniture is not None
     assert capture.furniture.frame.tolist() == [0, 3]
     assert capture.furniture.person.tolist() == [number, number]
     assert (decode(capture.furniture.masks, 1).numpy() == tiny.object_mask(0)).all()
     write_capture(capture, tmp_path / "again")
     again = read_capture(tmp_path / "again").furniture
-    assert again is not None
     assert again.masks.counts == capture.furniture.masks.counts
     (folder / "furniture.json").write_text(json.dumps(furniture(999)))
     with pytest.raises(InputError, match=r"furniture.json.*track_id' has 999, expected the id"):

@@ -9,7 +9,7 @@ import torch
 
 from mover.bodies.skinning import open_body
 from mover.core.records import fingerprint, rows_of
-from mover.core.types import Bodies, BodyPose, Capture, Detection, People, SceneObject
+from mover.core.types import Bodies, BodyPose, Capture, Detection, SceneObject
 from mover.geometry.camera import pitch_roll
 from mover.geometry.rle import decode
 from mover.geometry.rotations import axis_angle, rot_y
@@ -31,14 +31,10 @@ def noisy(tiny: KnownRoom, seed: int = 0, **errors: float) -> Capture:
 
 def posed(bodies: Bodies | None) -> tuple[Bodies, torch.Tensor, BodyPose]:
     """Bodies with their joints and parameters, which known rooms have."""
-    assert bodies is not None
-    assert bodies.joints is not None
-    assert bodies.pose is not None
     return bodies, bodies.joints, bodies.pose
 
 
 def shown(one: Detection) -> torch.Tensor:
-    assert one.mask is not None
     return decode(one.mask, 0)
 
 
@@ -62,8 +58,6 @@ def test_no_noise_gives_the_truth_back(tiny: KnownRoom) -> None:
         for name in ("t_world_object", "yaw", "scale"):
             assert torch.allclose(getattr(given, name), getattr(true, name), atol=1e-6)
     assert torch.allclose(posed(capture.bodies)[0].verts, tiny.bodies.verts, atol=5e-5)
-    assert isinstance(capture.people, People)
-    assert isinstance(tiny.capture.people, People)
     assert capture.people.masks.counts == tiny.capture.people.masks.counts
     assert capture.scene.ground is None
 
@@ -76,9 +70,7 @@ def test_noise_is_repeatable_differs_by_seed_and_leaves_the_truth(tiny: KnownRoo
     assert fingerprint(tiny) == before
 
 
-def test_a_wrong_camera_keeps_centres_in_the_camera_frame_and_projects_fronts(
-    tiny: KnownRoom,
-) -> None:
+def test_a_wrong_camera_keeps_centres_in_the_camera_frame_and_projects_fronts(tiny):
     capture = noisy(tiny, camera=5.0)
     true, wrong = tiny.truth.camera.R_cam_world, capture.scene.camera.R_cam_world
     for given, piece in pairs(tiny, capture):
@@ -108,7 +100,6 @@ def _light(tiny: KnownRoom) -> KnownRoom:
     """The room with three bodies only, for statistics over many seeds."""
     few = torch.arange(3)
     bodies = rows_of(tiny.bodies, few)
-    assert isinstance(tiny.capture.people, People)
     capture = dataclasses.replace(
         tiny.capture, bodies=bodies, people=rows_of(tiny.capture.people, few)
     )
@@ -213,14 +204,10 @@ def test_masks_grow_and_shrink_by_whole_pixels() -> None:
         assert (grown(mask, 0) == mask).all()
 
 
-def test_people_masks_are_off_by_at_most_the_stated_pixels_and_some_are_missed(
-    tiny: KnownRoom,
-) -> None:
+def test_people_masks_are_off_by_at_most_the_stated_pixels_and_some_are_missed(tiny):
     from scipy.ndimage import distance_transform_edt
 
     people, true = noisy(tiny, person_masks=3, missed_masks=0.25).people, tiny.capture.people
-    assert isinstance(people, People)
-    assert isinstance(true, People)
     assert 0.1 < 1 - len(people.frame) / len(true.frame) < 0.4
     rows = {int(f): k for k, f in enumerate(true.frame.tolist())}
     for k, frame in enumerate(people.frame.tolist()):

@@ -101,12 +101,8 @@ def test_a_checkpoint_in_the_published_shapes_loads_by_its_keys(tmp_path: Path):
     shapes = published(512, 512, 256)
     state = random_state(shapes)
     tree = {
-        "model": state,
-        "optimizer": {"state": {}},
-        "epoch_it": 3,
-        "it": 7,
-        "loss_val_best": 0.5,
-    }
+        "model": state, "optimizer": {"state": {}}, "epoch_it": 3, "it": 7, "loss_val_best": 0.5,
+    }  # fmt: skip
     torch.save(tree, tmp_path / "new.pt")
     torch.save(tree, tmp_path / "old.pt", _use_new_zipfile_serialization=False)  # as in 2019
     for name in ("new.pt", "old.pt"):
@@ -245,15 +241,7 @@ def test_the_shape_comes_back_in_its_own_box_and_axes(monkeypatch: pytest.Monkey
     assert float(thick.amax() - thick.amin()) > 2 * float(thin.amax() - thin.amin())
 
 
-def test_a_network_of_this_size_runs_on_a_mesh():
-    state = random_state(published(16, 16, 16))
-    state["decoder.fc_out.bias"].fill_(5.0)
-    assert is_closed(occupied_mesh(network_of(state), CORNER, SMALL).faces)
-
-
-def test_furniture_is_closed_by_the_checkpoint_that_the_user_names(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_furniture_is_closed_by_the_checkpoint_that_the_user_names(tmp_path, monkeypatch):
     """`--prepare.watertight occnet --prepare.occnet FILE`, on files in the published layout."""
     from test_prepare_objects import LIGHT, off_centre_box, piece_of
 

@@ -80,9 +80,7 @@ def copy(stood: layouts.Room, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_a_perfect_result_scores_one_and_zero_in_every_column(
-    copy: Path, stood: layouts.Room
-) -> None:
+def test_a_perfect_result_scores_one_and_zero_in_every_column(copy, stood):
     """The truth is boxes and a scan; the result is the furniture itself where it stands.
 
     Who touches is in an object with a vertex (Cont.), so that NonCol is not quite 1: here by the
@@ -205,9 +203,7 @@ def test_people_are_in_millimetres_and_overlaps_as_the_paper_prints_them(tmp_pat
     assert "+ depth" not in page
 
 
-def test_what_other_jobs_need_is_done_first_and_the_given_scene_needs_no_job(
-    tmp_path: Path,
-) -> None:
+def test_what_other_jobs_need_is_done_first_and_the_given_scene_needs_no_job(tmp_path):
     there = named_captures(tmp_path / "c", "vicon_03301", "vicon_03301_b")
     (there / "vicon_03301" / "fits").mkdir()
     (there / "vicon_03301" / "fits" / "RGB.npz").touch()
@@ -256,9 +252,7 @@ def test_fewer_steps_are_other_jobs_of_the_same_command_line(tmp_path: Path) -> 
     assert key_of(people) != key_of(replace(people, vposer=""))
 
 
-def test_feet_are_the_soles_that_posa_names_and_contacts_are_those_of_the_bodies(
-    copy: Path,
-) -> None:
+def test_feet_are_the_soles_that_posa_names_and_contacts_are_those_of_the_bodies(copy):
     capture = read_capture(copy)
     bodies = capture.bodies
     assert bodies is not None

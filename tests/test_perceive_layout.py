@@ -74,7 +74,6 @@ def drawn(piece: SceneObject, view: Camera) -> tuple[torch.Tensor, torch.Tensor]
     faces = mesh.faces[None]
     views = Crops(view.K[None], H, W)
     cover, depths = look(verts, Topology(faces, edges_of(mesh.faces)[None]), views, depth=True)
-    assert depths is not None
     depth = torch.where(depths.covered[0], depths.nearest[0], torch.inf)
     return cover[0] > 0.5, depth
 
@@ -165,9 +164,7 @@ def test_usual_sizes_constrain_the_height_of_the_camera(pieces: list[SceneObject
     assert torch.equal(known.R_cam_world, camera().R_cam_world)
 
 
-def test_a_thing_of_which_many_shapes_are_known_says_no_more_than_another(
-    pieces: list[SceneObject],
-):
+def test_a_thing_of_which_many_shapes_are_known_says_no_more_than_another(pieces):
     once = screen_inputs(pieces, 1.2)
     odd = torch.tensor([1.3, 1, 1, 1])[:, None, None]  # one is not of the usual size
     once = replace(once, points=once.points * odd)
@@ -178,9 +175,7 @@ def test_a_thing_of_which_many_shapes_are_known_says_no_more_than_another(
 
 
 @pytest.mark.slow
-def test_a_perfect_picture_gives_furniture_near_the_true_one(
-    pieces: list[SceneObject], tmp_path: Path
-):
+def test_a_perfect_picture_gives_furniture_near_the_true_one(pieces, tmp_path):
     run = Run(tmp_path)
     first = first_scene(picture(pieces, camera()), QUICK, run)
     assert [p.category for p in first.scene.objects] == list(ROOM)
@@ -199,7 +194,6 @@ def test_a_perfect_picture_gives_furniture_near_the_true_one(
 def test_a_depth_map_tells_the_floor_and_how_far_things_are(pieces: list[SceneObject]):
     view = camera()
     seen = picture(pieces, view, depth=True)
-    assert seen.depth is not None
     things = seen.masks.any(0)
     assert floor_height(seen.depth, view, things) == pytest.approx(HEIGHT, abs=0.03)
     assert floor_height(torch.full((H, W), torch.nan), view, things) is None
@@ -211,10 +205,8 @@ def test_a_depth_map_tells_the_floor_and_how_far_things_are(pieces: list[SceneOb
 @pytest.mark.parametrize("factor", [0.85, 1.0, 1.2])
 def test_a_known_height_tells_the_scale_of_a_depth_map(pieces: list[SceneObject], factor: float):
     seen = picture(pieces, camera(), depth=True)
-    assert seen.depth is not None
     off = replace(seen, depth=factor * seen.depth, height=HEIGHT)
     found = at_scale(off).depth
-    assert found is not None
     known = seen.depth.isfinite()
     assert torch.allclose(found[known], seen.depth[known], rtol=0.03)
     assert at_scale(replace(off, height=None)).depth is off.depth
@@ -240,9 +232,7 @@ def test_measured_depth_makes_it_better(tmp_path: Path):
     assert deep < min(0.3, plain)
 
 
-def test_feet_tell_the_tilt_and_the_height_of_the_camera(
-    pieces: list[SceneObject], small_room, tmp_path: Path
-):
+def test_feet_tell_the_tilt_and_the_height_of_the_camera(pieces, small_room, tmp_path):
     true = small_room.truth.camera
     level = replace(true, R_cam_world=torch.diag(torch.tensor([1.0, -1.0, -1.0])))
     seen = replace(picture(pieces, camera()), camera=level)
@@ -365,9 +355,7 @@ def write_capture_without_scene(folder: Path, seen: Picture) -> None:
     write_json(detections_to_json(seen.detections, seen.camera, None), folder / "objects.json")
 
 
-def test_a_first_scene_that_is_made_again_begins_where_the_first_did(
-    pieces: list[SceneObject], tmp_path: Path
-):
+def test_a_first_scene_that_is_made_again_begins_where_the_first_did(pieces, tmp_path):
     level, found, own = (camera(pitch, 0.0) for pitch in (-0.1, -0.2, -0.3))
     folder = tmp_path / "c"
     write_capture_without_scene(folder, picture(pieces[:1], level))
@@ -385,9 +373,7 @@ def test_a_first_scene_that_is_made_again_begins_where_the_first_did(
 
 
 @pytest.mark.slow
-def test_the_command_turns_masks_into_a_capture(
-    pieces: list[SceneObject], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_the_command_turns_masks_into_a_capture(pieces, tmp_path, capsys):
     folder = tmp_path / "c"
     write_capture_without_scene(folder, picture(pieces[:2], camera()))
     quick = ["--shapes", "2", "--keep", "2", "--turns", "2"]

@@ -68,22 +68,7 @@ def rows_of(folder: Path) -> dict[str, dict]:
     return json.loads((folder / "people.json").read_text())
 
 
-def test_each_still_is_a_frame_of_its_own(stills: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    imported("prox", stills, out, tmp_path, recording=FIRST)
-    assert len(list((out / "frames").iterdir())) == 3
-    bodies = read_bodies(out / "bodies.npz")
-    assert bodies.frame.tolist() == [0, 1, 2]
-    assert bodies.fps is None  # shots have no common clock
-    true = torch.from_numpy(made.person("smplx")["verts"][:3]).float()
-    torch.testing.assert_close(bodies.verts, true, atol=1e-4, rtol=0)
-    assert [row["image_id"] for row in rows_of(out)["annotations"]] == [0, 1, 2]
-    assert read_bodies(out / "truth" / "bodies.npz").frame.tolist() == [0, 1, 2]
-
-
-def test_several_recordings_of_one_room_are_one_capture(
-    stills: Path, plain: layouts.Room, tmp_path: Path
-) -> None:
+def test_several_recordings_of_one_room_are_one_capture(stills, plain, tmp_path):
     out = tmp_path / "out"
     boxes = stills / "boxes" / "bbox3d.json"
     found = imported("prox", stills, out, tmp_path, recordings=(FIRST, SECOND), boxes=boxes)
@@ -91,6 +76,8 @@ def test_several_recordings_of_one_room_are_one_capture(
     bodies, true = read_bodies(out / "bodies.npz"), read_bodies(out / "truth" / "bodies.npz")
     assert bodies.frame.tolist() == true.frame.tolist() == [0, 1, 2, 3, 4]
     assert bodies.person.unique().tolist() == [0]  # both are of subject 03301
+    assert bodies.fps is None  # shots have no common clock
+    assert [row["image_id"] for row in rows_of(out)["annotations"]] == [0, 1, 2, 3, 4]
     people = made.person("smplx")["verts"]
     wanted = torch.from_numpy(people[[0, 1, 2, 0, 1]]).float()
     torch.testing.assert_close(bodies.verts, wanted, atol=1e-4, rtol=0)
@@ -102,9 +89,7 @@ def test_several_recordings_of_one_room_are_one_capture(
     assert rows_of(whole) == rows_of(out)
 
 
-def test_videos_follow_one_another_with_a_minute_between(
-    plain: layouts.Room, tmp_path: Path
-) -> None:
+def test_videos_follow_one_another_with_a_minute_between(plain, tmp_path):
     root, names = tmp_path / "prox", ("MPH8_00034_01", "MPH8_00168_02")
     for name in names:
         layouts.write_prox(root, prox_room(plain), name, 2, SHIFT)
@@ -125,9 +110,7 @@ def test_body_indices_are_masks_of_the_flipped_pictures(stills: Path, tmp_path: 
     assert torch.equal(mask_of(rows_of(tmp_path / "out")["annotations"][1]), wanted)
 
 
-def test_the_reference_is_the_emptiest_picture_and_who_is_in_it_is_masked(
-    stills: Path, tmp_path: Path
-) -> None:
+def test_the_reference_is_the_emptiest_picture_and_who_is_in_it_is_masked(stills, tmp_path):
     root = shutil.copytree(stills, tmp_path / "p")
     stem = layouts.prox_stem(FIRST, 1)
     pixels = np.full((1080, 1920), 255, dtype=np.uint8)
@@ -148,17 +131,14 @@ def test_the_reference_is_the_emptiest_picture_and_who_is_in_it_is_masked(
     assert torch.equal(mask_of(row), wanted)
 
 
-@pytest.mark.parametrize(
-    ("pixels", "said"),
-    [
-        (np.full((1080, 1920), 128), "has the number 128, expected bodies 0 to 5, and 255"),
-        (
-            np.zeros((1080, 1920)),
-            "100% of the picture is a body, expected 255 where there is no person",
-        ),
-        (np.full((424, 512), 255), "has 512 x 424 pixels, expected 1920 x 1080"),
-    ],
-)
+@pytest.mark.parametrize(("pixels", "said"), [
+    (np.full((1080, 1920), 128), "has the number 128, expected bodies 0 to 5, and 255"),
+    (
+        np.zeros((1080, 1920)),
+        "100% of the picture is a body, expected 255 where there is no person",
+    ),
+    (np.full((424, 512), 255), "has 512 x 424 pixels, expected 1920 x 1080"),
+])  # fmt: skip
 def test_what_is_no_body_index_is_refused(pixels: np.ndarray, said: str, tmp_path: Path) -> None:
     Image.fromarray(pixels.astype(np.uint8)).save(tmp_path / "a.png")
     with pytest.raises(InputError, match=said):
@@ -195,21 +175,16 @@ def test_a_recording_of_another_room_is_refused(stills: Path, tmp_path: Path) ->
     shutil.rmtree(stills / "recordings" / "MPH8_00034_01")
 
 
-@pytest.mark.parametrize(
-    ("part", "said"),
-    [
-        ("recordings/vicon_03301_01/Color", "no pictures"),
-        ("recordings/vicon_03301_01/BodyIndexColor", "no depth order"),
-        ("keypoints/vicon_03301_01", "`mover fit` has nothing to fit"),
-        ("fittings/PROX/vicon_03301_01", "only the image speaks"),
-        ("fittings/mosh/vicon_03301_01", "no true bodies"),
-        ("cam2world", "no truth of the camera"),
-        ("scenes", "the truth has no floor"),
-    ],
-)
-def test_a_missing_part_is_named_and_the_rest_still_works(
-    part: str, said: str, stills: Path, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize(("part", "said"), [
+    ("recordings/vicon_03301_01/Color", "no pictures"),
+    ("recordings/vicon_03301_01/BodyIndexColor", "no depth order"),
+    ("keypoints/vicon_03301_01", "`mover fit` has nothing to fit"),
+    ("fittings/PROX/vicon_03301_01", "only the image speaks"),
+    ("fittings/mosh/vicon_03301_01", "no true bodies"),
+    ("cam2world", "no truth of the camera"),
+    ("scenes", "the truth has no floor"),
+])  # fmt: skip
+def test_a_missing_part_is_named_and_the_rest_still_works(part, said, stills, tmp_path):
     root = shutil.copytree(stills, tmp_path / "p")
     shutil.rmtree(root / part)
     found = imported("prox", root, tmp_path / "out", tmp_path, recording=FIRST)

@@ -5,7 +5,6 @@ import re
 import traceback
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import make_prox
 import make_scenes as layouts
@@ -39,9 +38,7 @@ def chosen_rows(room: KnownRoom, action: str, count: int) -> list[int]:
 
 
 @pytest.fixture(scope="module")
-def captures(
-    plain: layouts.Room, small_room: KnownRoom, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Path]:
+def captures(plain, small_room, tmp_path_factory):
     """Captures of a user's copy: two recordings of the quantitative room, two of another one.
 
     The fits are the truth, as MoSh's bodies are.
@@ -102,9 +99,7 @@ def kinds(name: str) -> tuple[str, ...]:
 
 
 @pytest.mark.parametrize("name", ["prox", "prox-quantitative"])
-def test_every_kind_of_row_is_made_from_the_files_of_prox(
-    name: str, captures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_kind_of_row_is_made_from_the_files_of_prox(name, captures, tmp_path, monkeypatch):
     args = TableArgs(name, captures, tmp_path, "paper", captures, only=kinds(name))
     numbers = made(args, monkeypatch)
     for part in TABLES[name].parts:
@@ -126,7 +121,6 @@ def test_every_kind_of_row_is_made_from_the_files_of_prox(
 def kinect_joints(room: KnownRoom, wanted: list[int]) -> np.ndarray:
     """Joints (frames, 25, 3) of some rows under Kinect's names; tips of hands are at the wrists."""
     bodies = room.bodies
-    assert bodies.joints is not None
     known = list(bodies.joint_names)
     places = [
         known.index(name if name in known else f"{name.partition('_')[0]}_wrist") for name in NAMES
@@ -135,9 +129,7 @@ def kinect_joints(room: KnownRoom, wanted: list[int]) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def graphs(
-    plain: layouts.Room, small_room: KnownRoom, tmp_path_factory: pytest.TempPathFactory
-) -> Path:
+def graphs(plain, small_room, tmp_path_factory):
     """Captures of two recordings of PiGraphs, one of them mirrored as Kinect's pictures are."""
     room, root = prox_room(plain), tmp_path_factory.mktemp("pigraphs")
     rows_ = [k for act in ("walk", "sit") for k in chosen_rows(small_room, act, 3)]
@@ -154,9 +146,7 @@ def graphs(
     return out
 
 
-def test_every_row_is_made_from_the_files_of_pigraphs(
-    graphs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_row_is_made_from_the_files_of_pigraphs(graphs, tmp_path, monkeypatch):
     args = TableArgs("pigraphs", graphs, tmp_path, "paper", graphs)
     numbers = made(args, monkeypatch)
     (part,) = TABLES["pigraphs"].parts

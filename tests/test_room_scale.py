@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -13,7 +12,7 @@ from test_pipeline import light
 
 from mover.bodies.parts import parts_of
 from mover.core.run import Run
-from mover.core.types import Capture, Layout
+from mover.core.types import Layout
 from mover.pipeline.reconstruct import reconstruct
 from mover.stages.objects.gather_given import gather_given
 from mover.stages.objects.room_scale import (
@@ -108,9 +107,7 @@ def test_more_seat_height_estimate_more() -> None:
 
 
 @pytest.mark.slow
-def test_a_room_of_people_of_unknown_height_says_how_uncertain_it_is(
-    small_capture: Capture, tmp_path: Path
-) -> None:
+def test_a_room_of_people_of_unknown_height_says_how_uncertain_it_is(small_capture, tmp_path):
     unknown = replace(small_capture, bodies=replace(small_capture.bodies, size_spread=0.06))
     given = [
         [w for w in reconstruct(capture, light("robust"), Run(tmp_path)).warnings if "heights" in w]

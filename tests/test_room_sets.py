@@ -77,7 +77,6 @@ def is_rich_and_free_of_overlap(room: KnownRoom, people: int) -> None:
     assert int(room.bodies.frame.max()) + 1 >= 200
     assert set(room.bodies.person.tolist()) == set(range(people))
     ground = room.truth.ground
-    assert ground is not None
     assert not any(overlap(a, b, 0.0) for a, b in combinations(room.plan.pieces, 2))
     assert all(abs(float(p.t_world_object[1]) - ground) < 1e-6 for p in room.truth.objects)
 
@@ -102,7 +101,6 @@ class TestPromises:
     def test_in_two_there_are_two_who_do_not_run_into_each_other(self) -> None:
         room = make_room(1003, SETS["two"].room)
         is_rich_and_free_of_overlap(room, 2)
-        assert room.bodies.joints is not None
         keys = zip(room.bodies.frame.tolist(), room.bodies.person.tolist(), strict=True)
         places = dict(zip(keys, room.bodies.joints[:, 0], strict=True))
         frames = {f for f, _ in places}
@@ -135,7 +133,6 @@ class TestPromises:
         assert set(person[frame < change].tolist()) == {0}
         assert set(person[frame > change].tolist()) == {1}
         assert not bool((frame == change).any())
-        assert room.capture.furniture is not None
 
     def test_a_seat_in_use_is_missing_from_withheld_seat(self, standard: KnownRoom) -> None:
         rooms, room = SETS["withheld-seat"], standard

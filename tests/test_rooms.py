@@ -121,9 +121,7 @@ def test_knees_and_elbows_bend_the_human_way(person: Person) -> None:
     ("name", "style"),
     [("chair", 0), ("chair", 2), ("armchair", 1), ("office chair", 0), ("stool", 2), ("sofa", 0)],
 )
-def test_a_sitter_presses_on_the_seat_and_keeps_the_feet_on_the_floor(
-    person: Person, name: str, style: int
-) -> None:
+def test_a_sitter_presses_on_the_seat_and_keeps_the_feet_on_the_floor(person, name, style):
     piece = stands(name, style)
     posture = seated(person, seat_spot((piece,), 0), piece)
     assert -0.02 < signed(person, posture, piece, "lower").min() < 0.0
@@ -202,7 +200,6 @@ def test_masks_are_what_an_independent_ray_caster_sees(tiny: KnownRoom) -> None:
     seen = draw([(m.verts.numpy(), m.faces.numpy()) for m in meshes], tiny.truth.camera)
     counts = np.zeros(seen.shape, dtype=int)
     for index, detection in enumerate(tiny.capture.detections):
-        assert detection.mask is not None
         mask = decode(detection.mask, 0).numpy()
         counts += mask
         true = seen == index
@@ -216,7 +213,6 @@ def test_masks_are_what_an_independent_ray_caster_sees(tiny: KnownRoom) -> None:
 
 def test_visible_people_and_furniture_share_the_image(tiny: KnownRoom) -> None:
     people, bodies = tiny.capture.people, tiny.bodies
-    assert people is not None
     row, R = 20, tiny.truth.camera.R_cam_world
     meshes = [place_object(p) for p in tiny.truth.objects]
     body = (to_world(bodies.verts[row], R).numpy(), bodies.faces.numpy())
@@ -227,17 +223,14 @@ def test_visible_people_and_furniture_share_the_image(tiny: KnownRoom) -> None:
 
 
 def test_pose_parameters_give_the_bodies(tiny: KnownRoom) -> None:
-    assert tiny.bodies.pose is not None
     verts, joints = open_body().posed(tiny.bodies.pose)
     assert float((verts - tiny.bodies.verts).abs().max()) < 1e-4
-    assert tiny.bodies.joints is not None
     assert float((joints - tiny.bodies.joints).abs().max()) < 1e-4
 
 
 def test_truth_neither_sinks_nor_gapes(tiny: KnownRoom) -> None:
     world = to_world(tiny.bodies.verts, tiny.truth.camera.R_cam_world).double().numpy()
     assert tiny.refused == ()
-    assert tiny.truth.ground is not None
     low = world[..., 1].min(1) - tiny.truth.ground
     assert np.abs(low).max() < 0.01
     count = len(world)

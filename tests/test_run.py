@@ -4,7 +4,6 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -99,9 +98,7 @@ DAMAGES = [cut, empty, flip, lift, poison, swap, older, Path.unlink]
 
 @pytest.mark.parametrize("damage", DAMAGES, ids=lambda d: d.__name__)
 @pytest.mark.parametrize("which", [0, 1], ids=["json", "npz"])
-def test_a_damaged_stage_is_said_and_computed_anew(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, damage: Callable[[Path], None], which: int
-) -> None:
+def test_a_damaged_stage_is_said_and_computed_anew(tmp_path, caplog, damage, which):
     wanted = Run(tmp_path).stage(doubled, PLANE, Twice())
     damage(files(tmp_path)[which])
     run = Run(tmp_path)
@@ -138,18 +135,15 @@ def test_what_a_killed_write_left_goes_away_with_a_later_one(tmp_path: Path) -> 
     assert sorted(p.name for p in tmp_path.iterdir()) == [".a-new.json", ".b-x3.json", "a.json"]
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"points": torch.zeros(4, 2)},
-        {"points": torch.zeros(4, 3, dtype=torch.int64)},
-        {"points": None},
-        {"ground": "low"},
-        {"ground": torch.zeros(())},
-        {"names": (1, 2)},
-        {"names": ["a", "b"]},
-    ],
-)
+@pytest.mark.parametrize("wrong", [
+    {"points": torch.zeros(4, 2)},
+    {"points": torch.zeros(4, 3, dtype=torch.int64)},
+    {"points": None},
+    {"ground": "low"},
+    {"ground": torch.zeros(())},
+    {"names": (1, 2)},
+    {"names": ["a", "b"]},
+])  # fmt: skip
 def test_what_is_wrong_is_refused_however_often_the_like_was_built(wrong: dict[str, Any]) -> None:
     for _ in range(3):
         replace(PLANE, points=torch.zeros(5, 3))

@@ -104,44 +104,38 @@ def test_presets_are_within_their_own_ranges(name):
     check_settings(PRESETS[name], name)
 
 
-@pytest.mark.parametrize(
-    ("command", "flags", "words"),
-    [
-        ("run", ("x", "--gather.cells", "0"), "has 0, expected a whole number from 8 to 512"),
-        ("run", ("x", "--place.weights.depth", "nan"), "--place.weights.depth: has nan"),
-        ("run", ("x", "--outer-iterations", "-3"), "--outer_iterations: has -3"),
-        ("render", ("x", "--width", "0"), "--width: has 0, expected a whole number from 16 to"),
-        ("view", ("x", "--port", "-1"), "--port: has -1"),
-        ("batch", ("x", "--gather.cells", "0"), "--gather.cells: has 0"),
-        ("batch", ("x", "--workers", "-1"), "--workers: has -1"),
-        ("batch", ("x", "--ray.cpus", "nan"), "--ray.cpus: has nan"),
-        ("video", ("x", "--out", "y", "--fov", "0"), "--fov: has 0"),
-        ("fit", ("k.npz", "--fps", "0"), "--fps: has 0.0, expected a number from 0.001 to 10,000"),
-        ("experiment", ("--workers", "-1"), "--workers: has -1"),
-    ],
-)
+@pytest.mark.parametrize(("command", "flags", "words"), [
+    ("run", ("x", "--gather.cells", "0"), "has 0, expected a whole number from 8 to 512"),
+    ("run", ("x", "--place.weights.depth", "nan"), "--place.weights.depth: has nan"),
+    ("run", ("x", "--outer-iterations", "-3"), "--outer_iterations: has -3"),
+    ("render", ("x", "--width", "0"), "--width: has 0, expected a whole number from 16 to"),
+    ("view", ("x", "--port", "-1"), "--port: has -1"),
+    ("batch", ("x", "--gather.cells", "0"), "--gather.cells: has 0"),
+    ("batch", ("x", "--workers", "-1"), "--workers: has -1"),
+    ("batch", ("x", "--ray.cpus", "nan"), "--ray.cpus: has nan"),
+    ("video", ("x", "--out", "y", "--fov", "0"), "--fov: has 0"),
+    ("fit", ("k.npz", "--fps", "0"), "--fps: has 0.0, expected a number from 0.001 to 10,000"),
+    ("experiment", ("--workers", "-1"), "--workers: has -1"),
+])  # fmt: skip
 def test_every_command_checks_its_numbers_before_it_reads_anything(command, flags, words, capsys):
     assert run_command(command, flags) == 2
     assert words in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("tree", "words"),
-    [
-        ({"config": {"place": 5}}, "config.place: has 5, expected settings"),
-        ({"config": {"place": {"yaws": "many"}}}, "place.yaws: has 'many', expected a whole"),
-        ({"config": {"place": {"yaw": 1}}}, "config.place.yaw: is no setting, expected one of"),
-        ({"config": {"nonsense": 1}}, "config.nonsense: is no setting"),
-        ({"config": {"image": {"borders": [1, math.nan]}}}, r"image.borders\[1\]: has"),
-        ({"config": {"image": {"borders": 3}}}, "image.borders: has 3, expected a list"),
-        ({"config": {"layout": {"method": {"steps": -1}}}}, "config.layout.method.steps: has -1"),
-        ({"config": {"layout": {"form": "new"}}}, "config.layout.form: has 'new', expected one of"),
-        ({"config": {"seat_heights": 1}}, "config.seat_heights: has 1, expected true or false"),
-        ({"config": 3}, "field 'config' has 3"),
-        ([], "has \\[\\], expected an object"),
-        ({}, "field 'config' has nothing"),
-    ],
-)
+@pytest.mark.parametrize(("tree", "words"), [
+    ({"config": {"place": 5}}, "config.place: has 5, expected settings"),
+    ({"config": {"place": {"yaws": "many"}}}, "place.yaws: has 'many', expected a whole"),
+    ({"config": {"place": {"yaw": 1}}}, "config.place.yaw: is no setting, expected one of"),
+    ({"config": {"nonsense": 1}}, "config.nonsense: is no setting"),
+    ({"config": {"image": {"borders": [1, math.nan]}}}, r"image.borders\[1\]: has"),
+    ({"config": {"image": {"borders": 3}}}, "image.borders: has 3, expected a list"),
+    ({"config": {"layout": {"method": {"steps": -1}}}}, "config.layout.method.steps: has -1"),
+    ({"config": {"layout": {"form": "new"}}}, "config.layout.form: has 'new', expected one of"),
+    ({"config": {"seat_heights": 1}}, "config.seat_heights: has 1, expected true or false"),
+    ({"config": 3}, "field 'config' has 3"),
+    ([], "has \\[\\], expected an object"),
+    ({}, "field 'config' has nothing"),
+])  # fmt: skip
 def test_a_file_of_settings_is_refused_with_the_field(tree, words, tmp_path):
     path = tmp_path / "run.json"
     path.write_text(json.dumps(tree))

@@ -155,20 +155,17 @@ NO_PEOPLE = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
 SOFA = rectangle(40, 20, 120, 60)
 
 
-@pytest.mark.parametrize(
-    ("first", "second", "people", "found"),
-    [
-        (rectangle(60, 60, 100, 100), SOFA, NO_PEOPLE, [(0, 1)]),  # a table in front of a sofa
-        (SOFA, rectangle(60, 60, 100, 100), NO_PEOPLE, [(1, 0)]),
-        (rectangle(130, 60, 160, 100), SOFA, NO_PEOPLE, []),  # no column is shared
-        (rectangle(60, 30, 100, 61), SOFA, NO_PEOPLE, []),  # bases are equally high
-        # the top of a table reaches over a chair whose legs are lower there, not as low as its own
-        (rectangle(60, 60, 90, 90), SOFA | rectangle(40, 60, 45, 100), NO_PEOPLE, []),
-        (rectangle(60, 60, 100, 100), SOFA, rectangle(40, 60, 60, 110), []),  # a person hides it
-        (rectangle(60, 90, 100, 118), rectangle(40, 80, 120, 120), NO_PEOPLE, []),  # the border
-        (NO_PEOPLE, SOFA, NO_PEOPLE, []),  # no mask
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("first", "second", "people", "found"), [
+    (rectangle(60, 60, 100, 100), SOFA, NO_PEOPLE, [(0, 1)]),  # a table in front of a sofa
+    (SOFA, rectangle(60, 60, 100, 100), NO_PEOPLE, [(1, 0)]),
+    (rectangle(130, 60, 160, 100), SOFA, NO_PEOPLE, []),  # no column is shared
+    (rectangle(60, 30, 100, 61), SOFA, NO_PEOPLE, []),  # bases are equally high
+    # the top of a table reaches over a chair whose legs are lower there, not as low as its own
+    (rectangle(60, 60, 90, 90), SOFA | rectangle(40, 60, 45, 100), NO_PEOPLE, []),
+    (rectangle(60, 60, 100, 100), SOFA, rectangle(40, 60, 60, 110), []),  # a person hides it
+    (rectangle(60, 90, 100, 118), rectangle(40, 80, 120, 120), NO_PEOPLE, []),  # the border
+    (NO_PEOPLE, SOFA, NO_PEOPLE, []),  # no mask
+])  # fmt: skip
 def test_bases_in_the_image_order_what_stands_on_the_floor(first, second, people, found):
     order = order_in_image(torch.stack([first, second & ~first]), people)
     assert order.nonzero().tolist() == [list(pair) for pair in found]

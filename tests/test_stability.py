@@ -206,15 +206,12 @@ def gallows() -> Mesh:
 
 
 @needs_mujoco
-@pytest.mark.parametrize(
-    ("mesh", "lift", "support", "moved", "turned"),
-    [
-        (box(0.6, 0.5, 0.6), 0.15, "ground", (0.14, 0.16), 0.0),  # floats: it falls as far
-        (box(0.6, 0.5, 0.6), -0.05, "ground", (0.04, 9.0), 0.0),  # is sunk: it comes up
-        (gallows(), 0.0, "ground", (0.1, 9.0), math.radians(15)),  # leans over its foot: it falls
-        (box(0.6, 0.5, 0.1), 1.0, "free", (0.0, 0.0), 0.0),  # hangs: it is held
-    ],
-)
+@pytest.mark.parametrize(("mesh", "lift", "support", "moved", "turned"), [
+    (box(0.6, 0.5, 0.6), 0.15, "ground", (0.14, 0.16), 0.0),  # floats: it falls as far
+    (box(0.6, 0.5, 0.6), -0.05, "ground", (0.04, 9.0), 0.0),  # is sunk: it comes up
+    (gallows(), 0.0, "ground", (0.1, 9.0), math.radians(15)),  # leans over its foot: it falls
+    (box(0.6, 0.5, 0.1), 1.0, "free", (0.0, 0.0), 0.0),  # hangs: it is held
+])  # fmt: skip
 def test_what_floats_is_sunk_or_leans_moves_and_what_hangs_is_held(
     mesh, lift, support, moved, turned, tmp_path: Path
 ):

@@ -111,7 +111,6 @@ def test_seated_people_observe_the_front_of_seats_with_backs_and_lying_people_th
         ),
         CONFIG.assign,
     )  # fmt: skip
-    assert found.points is not None
     torch.testing.assert_close(found.points.heading[bed], touches.heading[bed])
     width, _, depth = objects.size[touches.object_of].unbind(-1)
     long = ~bed & (torch.maximum(width / depth, depth / width) > LONG)  # sat on across that

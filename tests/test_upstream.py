@@ -22,9 +22,7 @@ from mover_bench.rooms.noise_masks import coarse, wobbled
 
 @pytest.mark.parametrize("maker", MAKERS, ids=lambda m: m.__name__.strip("_"))
 @pytest.mark.parametrize("name", ["chair", "shelf", "sofa"])
-def test_a_foreign_mesh_fills_the_box_and_is_another_shape(
-    name: str, maker: object, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_foreign_mesh_fills_the_box_and_is_another_shape(name, maker, monkeypatch):
     monkeypatch.setattr(foreign, "MAKERS", (maker,))
     known = make_piece(name, np.random.default_rng(1), 0)
     mesh, again = (foreign_mesh(known, 0.03, np.random.default_rng(5)) for _ in range(2))

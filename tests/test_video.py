@@ -39,9 +39,7 @@ class TestSteps:
         return lines
 
     @pytest.mark.parametrize("yours", [False, True])
-    def test_a_step_is_done_again_only_where_what_it_is_made_from_changed(
-        self, tmp_path: Path, yours: bool
-    ):
+    def test_a_step_is_done_again_only_where_what_it_is_made_from_changed(self, tmp_path, yours):
         source, made = tmp_path / "in.txt", tmp_path / "made.txt"
         source.write_text("a")
         assert len(self.do(tmp_path, "one", yours)) == 2
@@ -60,9 +58,7 @@ class TestSteps:
         self.do(tmp_path, "three", yours)
         assert made.read_text() == "three"
 
-    def test_what_a_step_made_of_another_video_goes_and_what_replaced_it_stays(
-        self, tmp_path: Path
-    ):
+    def test_what_a_step_made_of_another_video_goes_and_what_replaced_it_stays(self, tmp_path):
         made = tmp_path / "made.txt"
         for text in (None, "user's"):
             self.do(tmp_path, "one")
@@ -149,9 +145,7 @@ class TestNetworks:
         models = ModelsConfig()
         assert {models.masks, models.keypoints} == set(FACTS)
 
-    def test_the_command_says_so_before_any_work(
-        self, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-    ):
+    def test_the_command_says_so_before_any_work(self, tmp_path, capsys, monkeypatch):
         monkeypatch.setenv("HF_HUB_OFFLINE", "1")
         monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "empty"))
         (tmp_path / "a.mp4").write_bytes(b"no video")
@@ -181,14 +175,11 @@ class TestCuts:
         assert "--frames.end 0.6" in text
         assert "the longest is used, 0.6 to 1.8 s" in text
 
-    @pytest.mark.parametrize(
-        "agree",
-        [
-            [1.0, 0.9, 0.1, 0.1, 0.9, 0.9, 0.9, 0.9],  # a person passes close by
-            [1.0, 0.8, 0.6, 0.45, 0.3, 0.2, 0.1, 0.1],  # the camera walks away
-            [1.0] * 8,
-        ],
-    )
+    @pytest.mark.parametrize("agree", [
+        [1.0, 0.9, 0.1, 0.1, 0.9, 0.9, 0.9, 0.9],  # a person passes close by
+        [1.0, 0.8, 0.6, 0.45, 0.3, 0.2, 0.1, 0.1],  # the camera walks away
+        [1.0] * 8,
+    ])  # fmt: skip
     def test_a_person_who_passes_by_and_a_camera_that_walks_are_none(self, agree: list[float]):
         assert first_cut(agree) is None
 
@@ -208,9 +199,7 @@ def test_heights_are_told_to_the_room_by_track(tmp_path: Path):
 
 @pytest.mark.long
 @pytest.mark.usefixtures("quick")
-def test_a_video_becomes_a_room_and_files_that_are_replaced_stay(
-    tmp_path: Path, small_room, capsys: pytest.CaptureFixture[str]
-):
+def test_a_video_becomes_a_room_and_files_that_are_replaced_stay(tmp_path, small_room, capsys):
     pytest.importorskip("cv2")
     pytest.importorskip("av")
     from mover.app.pictures.film import save_film

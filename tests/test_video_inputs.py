@@ -59,9 +59,7 @@ def rows(capture: Path, name: str) -> list[dict[str, Any]]:
 
 @pytest.mark.parametrize("turns", [1, 2, 3])
 @pytest.mark.parametrize("tall", [False, True])
-def test_a_phone_that_was_turned_gives_what_an_upright_one_gives(
-    tmp_path: Path, turns: int, tall: bool
-):
+def test_a_phone_that_was_turned_gives_what_an_upright_one_gives(tmp_path, turns, tall):
     shot, times = Shot(tall=tall), range(0, SECOND, 3)
     upright = perceived(filmed(tmp_path / "a.mp4", shot, times), tmp_path / "upright")
     turned = perceived(
@@ -84,7 +82,6 @@ def test_what_moves_evenly_moves_evenly_in_an_uneven_video(tmp_path: Path):
     times = [*range(SECOND), *dim, *range(4 * SECOND, 5 * SECOND)]  # and none for a second
     capture = perceived(filmed(tmp_path / "v.mp4", Shot(), times), tmp_path / "c", fps=10)
     found = read_keypoints(capture / "keypoints.npz")
-    assert found.fps is not None
     true = torch.tensor([walk(float(t)) for t in found.frame / found.fps])
     middle = found.points[..., 0].mean(-1) - 10
     assert (middle - true).abs().max() < 12 * 0.5 / 10 + 1  # half a step of the clock, and a pixel
@@ -97,9 +94,7 @@ def test_what_moves_evenly_moves_evenly_in_an_uneven_video(tmp_path: Path):
 
 
 @pytest.mark.parametrize(("gap", "fps"), [(15, 5.0), (15, 0.0), (1, 0.0)])
-def test_of_a_slow_video_or_at_its_own_rate_all_frames_are_taken_at_their_times(
-    tmp_path: Path, gap: int, fps: float
-):
+def test_of_a_slow_video_or_at_its_own_rate_all_frames_are_taken_at_their_times(tmp_path, gap, fps):
     times = [*range(0, 20 * gap, gap), *range(60 * gap, 70 * gap, gap)]  # a pause between
     filmed(tmp_path / "v.mp4", Shot(), times)
     config = FramesConfig(fps=fps)
@@ -222,9 +217,7 @@ def test_without_a_network_for_furniture_all_else_is_written_and_the_outlines_ar
             picture.save(tmp_path / "masks" / f"{k:06d}.png")
 
 
-def test_of_a_video_that_is_cut_the_longest_shot_is_used_and_said(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_of_a_video_that_is_cut_the_longest_shot_is_used_and_said(tmp_path, capsys):
     shots = (Shot(1), Shot(2), Shot(1))
     ends = (1.0, 3.4, 5.0)
     times = range(0, 5 * SECOND, 6)
@@ -298,9 +291,7 @@ def room_of(args: VideoArgs, finders: Finders = FINDERS) -> Scene:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick")
-def test_without_people_the_picture_alone_places_the_furniture_and_that_is_said(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_without_people_the_picture_alone_places_the_furniture_and_that_is_said(tmp_path, capsys):
     filmed(tmp_path / "v.mp4", Shot(person=False), range(0, SECOND, 3))
     out = tmp_path / "out"
     scene = room_of(VideoArgs(tmp_path / "v.mp4", out, fov=60.0))
@@ -319,7 +310,6 @@ def test_ten_minutes_become_a_room(tmp_path: Path):
     scene = room_of(VideoArgs(tmp_path / "v.mp4", out, fov=60.0))
     assert [piece.id for piece in scene.objects] == ["chair_0"]
     found = read_keypoints(out / "capture" / "keypoints.npz")
-    assert found.fps is not None
     assert (found.frame / found.fps).tolist() == pytest.approx(
         [3.0 * k for k in range(200)], abs=0.1
     )
