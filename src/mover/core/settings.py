@@ -45,16 +45,6 @@ class Range(PrimitiveConstructorSpec[Any]):
         return self.low <= typing.cast(float, value) <= self.high
 
 
-def int_in(low: int, high: int) -> Range:
-    """The range of a whole number."""
-    return _range(int, low, high)
-
-
-def float_in(low: float, high: float) -> Range:
-    """The range of a number; it may end at infinity."""
-    return _range(float, low, high)
-
-
 def _range(kind: type[int] | type[float], low: float, high: float) -> Range:
     return Range(
         nargs=1,
@@ -64,6 +54,12 @@ def _range(kind: type[int] | type[float], low: float, high: float) -> Range:
         str_from_instance=lambda value: [str(value)],
         low=low, high=high, kind=kind,
     )  # fmt: skip
+
+
+int_in = functools.partial(_range, int)
+"""The range of a whole number."""
+float_in = functools.partial(_range, float)
+"""The range of a number; it may end at infinity."""
 
 
 def _short(number: float) -> str:

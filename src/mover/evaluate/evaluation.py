@@ -18,6 +18,7 @@ from mover.core.records import record
 from mover.core.run import Run
 from mover.core.settings import Count, Metres, int_in
 from mover.core.types import Bodies, Mesh, Scene
+from mover.evaluate import contact
 from mover.evaluate.bodies import (
     GROUND_METRICS,
     POSE_METRICS,
@@ -25,16 +26,6 @@ from mover.evaluate.bodies import (
     feet_places,
     gather_twins,
     soles_of,
-)
-from mover.evaluate.contact import (
-    TOUCH_METRICS,
-    Furniture,
-    Touch,
-    TrueTouch,
-    close_meshes,
-    furniture_of,
-    gather_touch,
-    gather_truth,
 )
 from mover.evaluate.scene import (
     CAMERA_METRICS,
@@ -65,7 +56,7 @@ METRICS: dict[str, Metric[Any]] = {
     **OBJECT_METRICS,
     **HARM_METRICS,
     **SCENE_METRICS,
-    **TOUCH_METRICS,
+    **contact.TOUCH_METRICS,
     **CAMERA_METRICS,
     **GROUND_METRICS,
     **POSE_METRICS,
@@ -102,7 +93,7 @@ class EvaluatedBodies:
     initial: Bodies | None
     result: Bodies | None
     truth: Bodies | None
-    touch: TrueTouch | None = None
+    touch: contact.TrueTouch | None = None
     """The true people beside the true furniture (`touch_in_truth`); None: it is measured."""
     named: Float[Tensor, "bodies verts"] | None = None
     """Chance that a vertex of `result` touches something (POSA), for feet that are contacts."""
@@ -147,9 +138,9 @@ def evaluate(
     both = dict(zip(SIDES, (before, after), strict=True))
     asked = {key: both[key] for key in SIDES if key in sides}
     scenes = before.scene, after.scene, true.scene
-    objects = measure_objects(scenes, sides, config.samples, config.by_place, config.boxes)
-    touch = bodies.touch or _true_touch(true, after.bodies or before.bodies, config)
     matched = dict(zip(SIDES, pairs(*scenes, config.by_place), strict=True))
+    objects = measure_objects(scenes, matched, sides, config.samples, config.boxes)
+    touch = bodies.touch or _true_touch(true, after.bodies or before.bodies, config)
 
     def of(key: str) -> dict[str, float]:
         judged = asked[key]
@@ -161,7 +152,9 @@ def evaluate(
         values |= measure(CAMERA_METRICS, Sight(judged.scene, true.scene))
         if judged.bodies is None:
             return values
-        near = gather_touch(judged.bodies, judged.furniture, touch, config.bodies, config.reach)
+        near = contact.gather_touch(
+            judged.bodies, judged.furniture, touch, config.bodies, config.reach
+        )
         feet = judged.bodies.verts[:, judged.soles] if len(judged.soles) else None
         if config.feet == "contacts":
             named = bodies.named if judged is after else None
@@ -175,7 +168,7 @@ def evaluate(
 
 def touch_in_truth(
     truth: Scene, bodies: EvaluatedBodies, config: EvaluateConfig
-) -> TrueTouch | None:
+) -> contact.TrueTouch | None:
     """The true people beside the true furniture, of the bodies that are judged; None: no truth."""
     true = _populate((truth, truth, truth), EvaluatedBodies(None, None, bodies.truth))[-1]
     return _true_touch(true, bodies.result or bodies.initial, config)
@@ -236,7 +229,7 @@ def table(metrics: Mapping[str, Any], shown: Sequence[str] | None = None) -> str
 
 
 def evaluate_people(
-    bodies: Bodies, floor: float | None, furniture: Furniture, truth: Bodies | None = None
+    bodies: Bodies, floor: float | None, furniture: contact.Furniture, truth: Bodies | None = None
 ) -> dict[str, float]:
     """How people of a room fit its floor [m] and closed furniture, and how wrong they are.
 
@@ -245,20 +238,20 @@ def evaluate_people(
     soles = members(parts_of(bodies), *SOLES)
     feet = bodies.verts[:, soles] if bool(soles.any()) else None
     config = EvaluateConfig()
-    near = gather_touch(bodies, furniture, None, config.bodies, config.reach)
+    near = contact.gather_touch(bodies, furniture, None, config.bodies, config.reach)
     return _people(bodies, near, feet, floor, config.ground_tolerance, truth)
 
 
 def _people(
     bodies: Bodies,
-    near: Touch,
+    near: contact.Touch,
     feet: Float[Tensor, "bodies points 3"] | None,
     floor: float | None,
     tolerance: float,
     truth: Bodies | None,
 ) -> dict[str, float]:
     """The metrics of a scene's people; what they or the truth do not give is left out."""
-    values = measure(TOUCH_METRICS, near)
+    values = measure(contact.TOUCH_METRICS, near)
     if floor is not None and feet is not None:
         values |= measure(GROUND_METRICS, Standing(feet[..., 1] - floor, tolerance))
     twins = None if truth is None else gather_twins(bodies, truth)
@@ -275,7 +268,9 @@ def _populate(scenes: tuple[Scene, Scene, Scene], people: EvaluatedBodies) -> li
         b if b and len(b.frame) else None for b in (people.initial, people.result, people.truth)
     ]
     pairs = list(zip(scenes, rows, strict=True))
-    closed = close_meshes(item for scene, b in pairs if b is not None for item in scene.objects)
+    closed = contact.close_meshes(
+        item for scene, b in pairs if b is not None for item in scene.objects
+    )
     return [_populated(scene, b, closed) for scene, b in pairs]
 
 
@@ -283,14 +278,14 @@ def _populated(scene: Scene, bodies: Bodies | None, closed: Mapping[str, Mesh]) 
     if bodies is None:
         return _Populated(doubled(scene), None, torch.zeros(0, dtype=torch.long), ())
     soles = soles_of(bodies, scene.camera)
-    furniture = doubled(tuple(furniture_of(scene.objects, closed)))
+    furniture = doubled(tuple(contact.furniture_of(scene.objects, closed)))
     people = in_world(doubled(bodies), scene.camera)
     return _Populated(doubled(scene), people, soles, furniture)
 
 
 def _true_touch(
     truth: _Populated, judged: Bodies | None, config: EvaluateConfig
-) -> TrueTouch | None:
+) -> contact.TrueTouch | None:
     if truth.bodies is None or judged is None:
         return None
-    return gather_truth(truth.bodies, truth.furniture, judged, config.bodies, config.reach)
+    return contact.gather_truth(truth.bodies, truth.furniture, judged, config.bodies, config.reach)

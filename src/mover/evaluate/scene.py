@@ -261,22 +261,21 @@ def unmatched(
 
 def measure_objects(
     scenes: tuple[Scene, Scene, Scene],
+    found: Mapping[str, Mapping[str, SceneObject]],
     sides: Sequence[str],
     samples: int,
-    by_place: bool,
     boxes: bool = False,
 ) -> list[dict[str, Any]]:
     """Each true object in the initial scene and in the result, as far as they are asked for.
 
     Args:
         scenes: The initial one, the result and the truth.
+        found: What stands for the true objects on both `SIDES`, as `pairs` has it.
         sides: Some of `SIDES`.
         samples: Points on each true surface.
-        by_place: Whether objects that bear no true name are paired by place.
         boxes: Whether the truth is boxes without meshes.
     """
     initial, result, truth = scenes
-    found = dict(zip(SIDES, pairs(initial, result, truth, by_place), strict=True))
     cameras = {"initial": initial.camera, "result": result.camera}
 
     def of(side: str, true: SceneObject) -> dict[str, float]:
