@@ -17,7 +17,7 @@ from mover.bodies.parts import SOLES, members, parts_of
 from mover.core.records import record
 from mover.core.run import Run
 from mover.core.settings import Count, Metres, int_in
-from mover.core.types import Bodies, Mesh, Scene
+from mover.core.types import Bodies, Scene
 from mover.evaluate import contact
 from mover.evaluate.bodies import (
     GROUND_METRICS,
@@ -93,8 +93,6 @@ class EvaluatedBodies:
     initial: Bodies | None
     result: Bodies | None
     truth: Bodies | None
-    touch: contact.TrueTouch | None = None
-    """The true people beside the true furniture (`touch_in_truth`); None: it is measured."""
     named: Float[Tensor, "bodies verts"] | None = None
     """Chance that a vertex of `result` touches something (POSA), for feet that are contacts."""
 
@@ -140,7 +138,11 @@ def evaluate(
     scenes = before.scene, after.scene, true.scene
     matched = dict(zip(SIDES, pairs(*scenes, config.by_place), strict=True))
     objects = measure_objects(scenes, matched, sides, config.samples, config.boxes)
-    touch = bodies.touch or _true_touch(true, after.bodies or before.bodies, config)
+    people, touch = after.bodies or before.bodies, None
+    if true.bodies is not None and people is not None:
+        touch = contact.gather_truth(
+            true.bodies, true.furniture, people, config.bodies, config.reach
+        )
 
     def of(key: str) -> dict[str, float]:
         judged = asked[key]
@@ -164,14 +166,6 @@ def evaluate(
         )
 
     return dict(zip(asked, mapped(of, list(asked)), strict=True)) | {"objects": objects}
-
-
-def touch_in_truth(
-    truth: Scene, bodies: EvaluatedBodies, config: EvaluateConfig
-) -> contact.TrueTouch | None:
-    """The true people beside the true furniture, of the bodies that are judged; None: no truth."""
-    true = _populate((truth, truth, truth), EvaluatedBodies(None, None, bodies.truth))[-1]
-    return _true_touch(true, bodies.result or bodies.initial, config)
 
 
 def evaluate_folder(
@@ -271,21 +265,12 @@ def _populate(scenes: tuple[Scene, Scene, Scene], people: EvaluatedBodies) -> li
     closed = contact.close_meshes(
         item for scene, b in pairs if b is not None for item in scene.objects
     )
-    return [_populated(scene, b, closed) for scene, b in pairs]
-
-
-def _populated(scene: Scene, bodies: Bodies | None, closed: Mapping[str, Mesh]) -> _Populated:
-    if bodies is None:
-        return _Populated(doubled(scene), None, torch.zeros(0, dtype=torch.long), ())
-    soles = soles_of(bodies, scene.camera)
-    furniture = doubled(tuple(contact.furniture_of(scene.objects, closed)))
-    people = in_world(doubled(bodies), scene.camera)
-    return _Populated(doubled(scene), people, soles, furniture)
-
-
-def _true_touch(
-    truth: _Populated, judged: Bodies | None, config: EvaluateConfig
-) -> contact.TrueTouch | None:
-    if truth.bodies is None or judged is None:
-        return None
-    return contact.gather_truth(truth.bodies, truth.furniture, judged, config.bodies, config.reach)
+    found: list[_Populated] = []
+    for scene, b in pairs:
+        soles, furniture = torch.zeros(0, dtype=torch.long), ()
+        if b is not None:
+            soles = soles_of(b, scene.camera)
+            furniture = doubled(tuple(contact.furniture_of(scene.objects, closed)))
+        world = None if b is None else in_world(doubled(b), scene.camera)
+        found.append(_Populated(doubled(scene), world, soles, furniture))
+    return found
