@@ -199,24 +199,15 @@ def skinned(
     offset = places - torch.einsum("bjik,bjk->bji", world, joints)
     moves = torch.cat([world, offset[..., None]], -1)
     some = (x.split(AT_ONCE) for x in (moves, verts, transl))
-    weights = model.weights.to(moves)
-    skin = [_blended(weights, *few) for few in zip(*some, strict=True)]
+    weights, skin = model.weights.to(moves), list[Tensor]()
+    for move, rest, shift in zip(*some, strict=True):
+        bodies, count = move.shape[:2]
+        flat = move.permute(1, 3, 0, 2).reshape(count, bodies * 12)
+        x, y, z, put = (weights @ flat).view(-1, 4, bodies, 3).unbind(1)
+        at = rest.transpose(0, 1).unsqueeze(-1)
+        moved = x * at[:, :, 0] + y * at[:, :, 1] + z * at[:, :, 2] + put + shift
+        skin.append(moved.transpose(0, 1).contiguous())
     return torch.cat(skin), places + transl[:, None]
-
-
-def _blended(
-    weights: Float[Tensor, "verts joints"],
-    moves: Float[Tensor, "bodies joints 3 4"],
-    verts: Float[Tensor, "bodies verts 3"],
-    transl: Float[Tensor, "bodies 3"],
-) -> Float[Tensor, "bodies verts 3"]:
-    """The rest shape of a few bodies, moved with the joints [m]."""
-    bodies, count = moves.shape[:2]
-    flat = moves.permute(1, 3, 0, 2).reshape(count, bodies * 12)
-    x, y, z, put = (weights @ flat).view(-1, 4, bodies, 3).unbind(1)
-    at = verts.transpose(0, 1).unsqueeze(-1)
-    moved = x * at[:, :, 0] + y * at[:, :, 1] + z * at[:, :, 2] + put + transl
-    return moved.transpose(0, 1).contiguous()
 
 
 ANGLES = {

@@ -12,13 +12,12 @@ import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from tyro.constructors import PrimitiveConstructorSpec
 
 from mover.core.errors import InputError
 
-T = TypeVar("T")
 MOST_SHOWN = 60  # letters of a wrong value in a message
 UNIONS = (Union, types.UnionType)
 WORDS = {bool: "true or false", str: "text", Path: "a path", types.NoneType: "nothing"}
@@ -106,15 +105,6 @@ def check_settings(settings: object, name: str) -> None:
         _check(getattr(settings, key), hint, name if flat else _joined(name, key))
 
 
-def read_settings(kind: type[T], tree: object, name: str) -> T:
-    """Settings from plain JSON values, checked; what is missing keeps its default.
-
-    Raises:
-        InputError: If one is unknown, of a wrong type, or out of its range.
-    """
-    return typing.cast(T, _built(kind, tree, name))
-
-
 def _joined(name: str, key: str) -> str:
     return f"{name}{key}" if name in ("--", "") else f"{name}.{key}"
 
@@ -154,8 +144,14 @@ def _wrong(value: Any, hint: Any, name: str) -> str:  # noqa: ANN401
     return "" if hint not in WORDS or isinstance(value, hint) else WORDS[hint]
 
 
-def _built(hint: Any, tree: Any, name: str) -> Any:  # noqa: ANN401
-    """A value of plain JSON values, checked before a record is built of it."""
+def read_settings(hint: Any, tree: Any, name: str) -> Any:  # noqa: ANN401
+    """Settings of this type from plain JSON values, checked before a record is built of them.
+
+    What is missing keeps its default.
+
+    Raises:
+        InputError: If one is unknown, of a wrong type, or out of its range.
+    """
     args = get_args(hint)
     kinds = [one for one in (args if get_origin(hint) in UNIONS else (hint,))
              if isinstance(one, type) and dataclasses.is_dataclass(one)]  # fmt: skip
@@ -166,10 +162,10 @@ def _built(hint: Any, tree: Any, name: str) -> Any:  # noqa: ANN401
             if key not in fields:
                 known = ", ".join(fields)
                 raise InputError(f"{_joined(name, key)}: is no setting, expected one of {known}")
-        return kind(**{k: _built(fields[k], v, _joined(name, k)) for k, v in tree.items()})
+        return kind(**{k: read_settings(fields[k], v, _joined(name, k)) for k, v in tree.items()})
     if isinstance(tree, list):
         items = args[:1] * len(tree) if Ellipsis in args else (*args, *[Any] * len(tree))
         pairs = enumerate(zip(items, tree, strict=False))
-        tree = tuple(_built(kind, one, f"{name}[{i}]") for i, (kind, one) in pairs)
+        tree = tuple(read_settings(kind, one, f"{name}[{i}]") for i, (kind, one) in pairs)
     _check(tree, hint, name)
     return tree

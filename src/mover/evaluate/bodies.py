@@ -49,26 +49,6 @@ def ground_penetration_distance(standing: Standing) -> float:
     return float(-standing.heights[below].mean()) if bool(below.any()) else 0.0
 
 
-def pje(twins: Twins) -> float | None:
-    """Mean distance of the joints [m], without any alignment."""
-    return _distance(twins.joints)
-
-
-def v2v(twins: Twins) -> float | None:
-    """Mean distance of corresponding vertices [m], without any alignment."""
-    return _distance(twins.verts)
-
-
-def p_pje(twins: Twins) -> float | None:
-    """Mean distance of the joints [m] after the best similarity transform of each body."""
-    return _distance(twins.joints, aligned=True)
-
-
-def p_v2v(twins: Twins) -> float | None:
-    """Mean distance of the vertices [m] after the best similarity transform of each body."""
-    return _distance(twins.verts, aligned=True)
-
-
 GROUND_METRICS: dict[str, Metric[Standing]] = {
     "ground_penetration_frequency": Metric(
         "Soles under the floor", "share", 0.0, ground_penetration_frequency
@@ -78,11 +58,17 @@ GROUND_METRICS: dict[str, Metric[Standing]] = {
     ),
 }
 POSE_METRICS: dict[str, Metric[Twins]] = {
-    "pje": Metric("Error of the joints", "m", 0.0, pje),
-    "v2v": Metric("Error of the body's surface", "m", 0.0, v2v),
-    "p_pje": Metric("Error of the joints, aligned", "m", 0.0, p_pje),
-    "p_v2v": Metric("Error of the body's surface, aligned", "m", 0.0, p_v2v),
+    "pje": Metric("Error of the joints", "m", 0.0, lambda t: _distance(t.joints)),
+    "v2v": Metric("Error of the body's surface", "m", 0.0, lambda t: _distance(t.verts)),
+    "p_pje": Metric(
+        "Error of the joints, aligned", "m", 0.0, lambda t: _distance(t.joints, aligned=True)
+    ),
+    "p_v2v": Metric(
+        "Error of the body's surface, aligned", "m", 0.0, lambda t: _distance(t.verts, aligned=True)
+    ),
 }
+"""Mean distances of corresponding points [m], without any alignment; aligned: after the best
+similarity transform of each body."""
 
 
 def soles_of(bodies: Bodies, camera: Camera) -> Int[Tensor, " soles"]:

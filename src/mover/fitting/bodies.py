@@ -157,7 +157,12 @@ def _stages(
     stages, some = tracks.stages_of(config, names), rows_of(keypoints, rows)
     at, frame = rows_of(state.at, rows, "bodies"), rows_of(state.frame, rows, "bodies")
     state, noise = FitState(at, frame, rows_of(state.seen, rows, "bodies"), config), None
-    state = state.given(motion=tracks.motion_of(some, _speed(state, some), config))
+    speed = None  # of joints across the view [m/s]
+    if some.fps is not None:
+        there = tracks.confidence_of(some, config) > 0
+        pixels = tracks.joint_speed(some, there).to(at.place)
+        speed = pixels * unknowns.log_depth(at, frame).exp()[:, None] / state.seen.K[0, 0]
+    state = state.given(motion=tracks.motion_of(some, speed, config))
     for index, stage in enumerate(stages):
         if state.at.floor.numel():  # the share of the bodies that their legs carry
             with torch.no_grad():
@@ -223,15 +228,6 @@ def _laid(state: FitState, keypoints: Keypoints) -> FitState:
     depth = torch.where(free, at.place[:, 2], about)
     place = torch.cat([at.place[:, :2], depth[:, None]], -1)
     return state.at_values(place=place).given(about=about)
-
-
-def _speed(state: FitState, keypoints: Keypoints) -> Float[Tensor, "rows joints"] | None:
-    """How fast joints seem to move across the view [m/s]; None without a frame rate."""
-    if keypoints.fps is None:
-        return None
-    there = tracks.confidence_of(keypoints, state.config) > 0
-    pixels = tracks.joint_speed(keypoints, there).to(state.at.place)
-    return pixels * unknowns.log_depth(state.at, state.frame).exp()[:, None] / state.seen.K[0, 0]
 
 
 def pose_of(at: unknowns.Unknowns, frame: unknowns.Frame, model: SkinnedBody) -> BodyPose:

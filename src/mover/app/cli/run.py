@@ -185,7 +185,7 @@ class DemoArgs:
 def demo(arguments: Sequence[str]) -> None:
     """`mover demo`."""
     args = flags.parsed(DemoArgs, "mover demo", arguments)
-    config = flags.preset_named(args.preset)
+    config = flags.preset_named(args.preset, PRESETS)
     from mover.app.demo import write_demo
     from mover.app.report.page import write_report
     from mover.app.results import Origin, report_of

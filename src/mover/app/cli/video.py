@@ -17,6 +17,7 @@ from mover.core.errors import InputError
 from mover.core.settings import Index, float_in
 from mover.perceive.config import LayoutConfig, Lens, PerceiveConfig
 from mover.perceive.needs import check_needs
+from mover.pipeline.presets import PRESETS
 
 if TYPE_CHECKING:
     from mover.perceive.capture import Finders
@@ -198,7 +199,7 @@ def video_to_room(
     source, config = args.source, config or PerceiveConfig()
     if not source.exists():
         raise InputError(f"{source}: there is no such file, expected a video or a folder")
-    flags.preset_named(args.preset)
+    flags.preset_named(args.preset, PRESETS)
     chain.BodiesFrom(args.bodies, args.bodies_tool).check()
     if finders is None:
         _check_needs(args, config)  # in the first second: nothing heavy is loaded yet
@@ -343,7 +344,6 @@ def _room(capture: Path, args: VideoArgs) -> None:
     say(f"{len(STEPS)}/{len(STEPS)} {STEPS[-1]} ...")
     people = (capture / "bodies.npz").is_file()
     origin = Origin(str(capture.resolve()), refine=people, device=device_of(args.device))
-    reconstruct_into(
-        args.out / "room", read("folder", capture), flags.preset_named(args.preset), origin
-    )
+    preset = flags.preset_named(args.preset, PRESETS)
+    reconstruct_into(args.out / "room", read("folder", capture), preset, origin)
     say(f"report: {args.out / 'room' / 'report.html'}")

@@ -248,7 +248,11 @@ def _solid(item: SceneObject, convex: Convex, floor: float) -> Solid:
     position = position - torch.tensor([0.0, 0.0, floor], dtype=torch.float64)
     volume = abs(convex.volume) * float(scale.prod())
     mass = max(LEAST, volume * DENSITY.get(canonical(item.category), OTHER))
-    inertia = AXES @ _stretched(convex.inertia, scale) @ AXES.mT * mass / max(volume, 1e-9)
+    one = torch.eye(3, dtype=scale.dtype)  # of a solid that is stretched at the same density
+    spread = one * convex.inertia.trace() / 2 - convex.inertia
+    spread = spread * scale[:, None] * scale[None] * scale.prod()
+    stretched = one * spread.trace() - spread
+    inertia = AXES @ stretched @ AXES.mT * mass / max(volume, 1e-9)
     return Solid(
         id=item.id, position=position, yaw=float(item.yaw), free=item.support != "free",
         hulls=tuple(Mesh(h.verts.double() * scale @ AXES.mT, h.faces) for h in convex.hulls),
@@ -261,13 +265,6 @@ def moved_to(solid: Solid, item: SceneObject, frame: int) -> Solid:
     there = placed_at(item, frame)
     way = AXES @ (there.t_world_object - item.t_world_object).detach().cpu().double()
     return dataclasses.replace(solid, position=solid.position + way, yaw=float(there.yaw))
-
-
-def _stretched(inertia: Float[Tensor, "3 3"], scale: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """Inertia of a solid that is stretched along its axes, at the same density."""
-    spread = torch.eye(3, dtype=inertia.dtype) * inertia.trace() / 2 - inertia
-    spread = spread * scale[:, None] * scale[None] * scale.prod()
-    return torch.eye(3, dtype=inertia.dtype) * spread.trace() - spread
 
 
 def _physical(inertia: Float[Tensor, "3 3"], mass: float) -> Float[Tensor, "3 3"]:

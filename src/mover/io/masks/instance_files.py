@@ -258,7 +258,10 @@ def coco_instances(
         rows = [(item, row) for item, row in rows if row.image_id == ours.id]
     if picture is not None and len(rows) > MOST_THINGS:
         at.get("annotations").refuse(f"at most {MOST_THINGS} in a picture", f"{len(rows)} items")
-    sizes = {image.id: _size_of_image(item, image, size) for item, image in listed}
+    sizes: dict[int, Size] = {}
+    for item, image in listed:
+        own = (image.width, image.height) if image.width and image.height else size
+        sizes[image.id] = own or item.refuse("width and height, here or by --image")
     tracked = any(row.track_id is not None for _, row in rows)
     frames, more = _frames_of_images([image for _, image in listed], at.file, tracked=tracked)
     found = [_instance(item, row, sizes[row.image_id or 0], words, frames) for item, row in rows]
@@ -266,12 +269,6 @@ def coco_instances(
         at.get("images").refuse("images of one size", f"{len(set(sizes.values()))} sizes")
     looked, own = frozenset(frames.values()), next(iter(sizes.values()), size)
     return Instances(tuple(found), own, at.file, looked, (*notes, *more))
-
-
-def _size_of_image(at: At, image: ImageFields, size: Size | None) -> Size:
-    """Width and height of an image: its own, else the known ones [px]."""
-    own = (image.width, image.height) if image.width and image.height else size
-    return own or at.refuse("width and height, here or by --image")
 
 
 def _ours(
