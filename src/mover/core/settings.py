@@ -74,8 +74,6 @@ Metres = Annotated[float, float_in(0, 100)]
 Seconds = Annotated[float, float_in(0, 1e6)]
 Rate = Annotated[float, float_in(1e-3, 1e4)]
 """Of frames a second."""
-Pixels = Annotated[int, int_in(1, 32768)]
-"""Along a side of a picture."""
 Count = Annotated[int, int_in(1, 1_000_000)]
 Steps = Annotated[int, int_in(0, 1_000_000)]
 """Of a descent, or rounds of one; 0: none."""
