@@ -10,15 +10,15 @@ from PIL import Image
 
 import mover.io.export.solids
 from mover.app.cli import run_command
-from mover.app.results import labels_of, write_truth
+from mover.app.results import write_truth
 from mover.core.records import rows_of
-from mover.core.run import Run
 from mover.io.capture.scene_file import read_scene
 from mover.io.export.contacts import write_labels
 from mover.io.files.meshes import write_mesh
 from mover.io.formats import names
 from mover.pipeline.refine import finished_room
-from mover.pipeline.result import to_world
+from mover.pipeline.result import label_inputs, to_world
+from mover.stages.contacts.label_contacts import label_contacts
 
 pytestmark = pytest.mark.slow
 TEXTURED = "chair_0"
@@ -39,7 +39,7 @@ def out(demo_room, tmp_path_factory):
     shape.export(folder / "meshes" / f"{TEXTURED}.glb")
     for piece in demo_room.truth.objects:
         write_mesh(piece.mesh, folder / "watertight" / f"{piece.id}.glb")
-    write_labels(labels_of(finished_room(folder), Run(folder)), folder / "contacts.npz")
+    write_labels(label_contacts(label_inputs(finished_room(folder))), folder / "contacts.npz")
     with pytest.MonkeyPatch.context() as patch:  # CoACD has a test of its own
         patch.setattr(mover.io.export.solids, "find_spec", lambda _: None)
         asked = [str(folder), "--to", *names("export"), "--up", "z"]

@@ -344,7 +344,7 @@ def test_costs_are_those_of_the_publication():
     elbow[1, 52] = 0.7  # the left elbow, backwards: index 55 of the full pose less the root's three
     cost = priors.bent_wrong(elbow).exp().square().sum(-1)
     assert cost.tolist() == pytest.approx([4.0, 3 + np.exp(1.4)], rel=1e-5)
-    assert PUBLISHED[2].pose == 57.4
+    assert PUBLISHED[0].pose == 4.78
 
 
 def test_limits_mirror_left_and_right_and_hold_the_resting_pose():

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from mover.evaluate import bodies as errors
 from mover.evaluate import contact as contacts
+from mover.evaluate.scene import measure
 
 BOX = [contacts.StandingMesh(cuboid(1, 1, 1))]  # its top is at 1
 INSIDE, ABOVE = (0.92, 1.32), (1.04, 1.44)  # five rows, of which one is inside; none is
@@ -111,9 +112,10 @@ def test_pose_errors_are_in_the_world_and_aligned_ones_are_not():
     shift = torch.tensor([0.03, 0.0, 0.04])
     wrong = replace(bodies, verts=bodies.verts + shift, joints=bodies.joints + shift)
     found = errors.gather_twins(wrong, bodies)
-    assert (errors.pje(found), errors.v2v(found)) == pytest.approx((0.05, 0.05), rel=1e-4)
-    assert (errors.p_pje(found), errors.p_v2v(found)) == pytest.approx((0, 0), abs=1e-5)
-    assert found.joints.shape == (3, 22, 3)
+    pje, v2v, p_pje, p_v2v = measure(errors.POSE_METRICS, found).values()
+    assert (pje, v2v) == pytest.approx((0.05, 0.05), rel=1e-4)
+    assert (p_pje, p_v2v) == pytest.approx((0, 0), abs=1e-5)
+    assert [joints.shape for joints in found.joints] == [(3, 22, 3)] * 2
 
 
 def test_joints_are_paired_by_name():
@@ -121,10 +123,10 @@ def test_joints_are_paired_by_name():
     order = torch.randperm(55, generator=torch.Generator().manual_seed(0))
     names = tuple(bodies.joint_names[i] for i in order)
     shuffled = replace(bodies, joints=bodies.joints[:, order], joint_names=names)
-    assert errors.pje(errors.gather_twins(shuffled, bodies)) == 0
+    assert measure(errors.POSE_METRICS, errors.gather_twins(shuffled, bodies))["pje"] == 0
 
 
 def test_points_that_coincide_have_an_aligned_error_and_no_nan():
     same, spread = torch.zeros(1, 4, 3), torch.eye(4)[None, :, :3]
-    value = errors.p_v2v(errors.Twins(same, spread, None, None))
+    value = measure(errors.POSE_METRICS, errors.Twins((same, spread), None))["p_v2v"]
     assert value == pytest.approx(float((spread - spread.mean(-2)).norm(dim=-1).mean()))

@@ -8,8 +8,7 @@ import torch
 
 from mover.core.records import record
 from mover.core.types import Bodies, Camera, Capture, Room, Scene, SceneObject
-from mover.evaluate.contact import TrueTouch
-from mover.evaluate.evaluation import EvaluateConfig, EvaluatedBodies, evaluate, touch_in_truth
+from mover.evaluate.evaluation import EvaluateConfig, EvaluatedBodies, evaluate
 from mover.evaluate.scene import Pair, iou3d, unmatched
 from mover.extensions.moving_camera import bodies_as_given
 from mover.furniture.library import SEATS, canonical
@@ -36,22 +35,17 @@ class Trial:
 
 
 class Judge:
-    """Measures scenes of a trial; what they share is measured once."""
+    """Measures scenes of a trial; the initial one once."""
 
     def __init__(self, trial: Trial, config: EvaluateConfig | None = None) -> None:
         self.trial = trial
         self.config = replace(config or EvaluateConfig(), by_place=False)  # names are known
-        self.touch: TrueTouch | None = None
-        given = trial.capture.bodies
-        if given is not None:
-            bodies = EvaluatedBodies(None, given, trial.bodies)
-            self.touch = touch_in_truth(trial.truth, bodies, self.config)
-        people = None if given is None else bodies_as_given(trial.capture)
+        people = None if trial.capture.bodies is None else bodies_as_given(trial.capture)
         self.initial = self.scene(trial.capture.scene, people)
 
     def scene(self, scene: Scene, people: Bodies | None) -> dict[str, Any]:
         """All metrics of a scene: `result` and `objects`."""
-        bodies = EvaluatedBodies(None, people, self.trial.bodies, self.touch)
+        bodies = EvaluatedBodies(None, people, self.trial.bodies)
         given, truth = self.trial.capture.scene, self.trial.truth
         return evaluate(given, scene, truth, bodies, self.config, ("result",))
 

@@ -7,11 +7,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mover.app.demo import DATA, TENSORS
+from mover.app.demo import DATA
 from mover.app.results import write_truth
 from mover.core.records import rows_of
 from mover.core.types import BodyPose
 from mover.io.capture.folder import write_capture
+from mover.io.capture.pose_file import NEEDED
 from mover_bench.rooms.config import NoiseConfig
 from mover_bench.rooms.known import demo_plan, demo_room, in_camera
 from mover_bench.rooms.noise import add_noise, noisy_pose
@@ -21,7 +22,7 @@ SEED = 0  # of the noise
 
 def write_people(pose: BodyPose, frame: Tensor, fps: float, path: Path) -> None:
     """What `mover.app.demo.read_people` reads: parameters in float64, of one person."""
-    tensors = {name: getattr(pose, name).numpy() for name in TENSORS}
+    tensors = {name: getattr(pose, name).numpy() for name in NEEDED}
     np.savez_compressed(path, **tensors, frame=frame.numpy(), fps=np.array(fps))
 
 

@@ -18,7 +18,7 @@ from mover.core.devices import CPU, named
 from mover.core.files import replacing
 from mover.core.run import Run
 from mover.core.settings import read_settings
-from mover.core.types import Bodies, Capture, ContactLabels, Room, Scene
+from mover.core.types import Bodies, Capture, Room, Scene
 from mover.extensions.missing_seats import PROPOSED, write_proposals
 from mover.extensions.moving_camera import bodies_as_given
 from mover.io.capture.bodies_file import write_bodies
@@ -62,7 +62,8 @@ def write_results(
     if room.bodies is not None:
         write_bodies(room.bodies, out / "bodies.npz")
         write_bodies(initial_bodies(capture), out / "initial_bodies.npz")
-        write_labels(labels_of(room, run), out / "contacts.npz")
+        labels = run.stage(label_contacts, label_inputs(room), None)
+        write_labels(labels, out / "contacts.npz")
     for item, proxy in zip(room.scene.objects, room.proxies, strict=True):
         shape = trimesh.Trimesh(proxy.verts.numpy(), proxy.faces.numpy(), process=False)
         with replacing(out / "watertight" / f"{item.id}.glb") as part:
@@ -76,11 +77,6 @@ def write_results(
     write_scene(room.scene, out / "scene.json", evidence)
     if report:
         write_report(out, report_of(capture, room, config, run))
-
-
-def labels_of(room: Room, run: Run) -> ContactLabels:
-    """Who touches what in a finished room with people."""
-    return run.stage(label_contacts, label_inputs(room), None)
 
 
 def write_truth(scene: Scene, bodies: Bodies, folder: Path) -> None:

@@ -5,10 +5,10 @@ from functools import partial
 from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor
 
-from mover.bodies.skinning import open_body
+from mover.bodies.skinning import Posed, open_body
 from mover.bodies.smpl_files import load_smpl
 from mover.core.errors import InputError
 from mover.core.records import rows_of
@@ -34,16 +34,12 @@ class BodyModel(Protocol):
         """Names of its joints, in order."""
         ...
 
-    def posed(
-        self, pose: BodyPose
-    ) -> tuple[Float[Tensor, "bodies verts 3"], Float[Tensor, "bodies joints 3"]]:
+    def posed(self, pose: BodyPose) -> Posed:
         """Vertices and joints [m], differentiable in all of `pose`."""
         ...
 
 
-def run_model(
-    model: BodyModel, pose: BodyPose, rows: int = 128
-) -> tuple[Float[Tensor, "bodies verts 3"], Float[Tensor, "bodies joints 3"]]:
+def run_model(model: BodyModel, pose: BodyPose, rows: int = 128) -> Posed:
     """Vertices and joints, some rows at a time to bound the memory [m]."""
     with torch.no_grad():
         parts = [model.posed(rows_of(pose, r)) for r in torch.arange(len(pose.transl)).split(rows)]

@@ -81,7 +81,7 @@ def parts_of(bodies: Bodies, up_cam: Float[Tensor, "3"] | None = None) -> BodyPa
 
 
 def _find(bodies: Bodies, up_cam: Float[Tensor, "3"] | None) -> BodyParts:
-    model = known_model(bodies.faces, bodies.verts.shape[1]) or _users_model(bodies)
+    model = _model_of(bodies)
     if model is not None:
         return BodyParts(model_parts(model), landmark_rings(model))
     listed = _listed(bodies)
@@ -143,24 +143,19 @@ def _of_open_body(bodies: Bodies) -> Int[Tensor, " verts"]:
     return torch.where(torch.from_numpy(far) < FAR, part, -1)
 
 
-def known_model(faces: Int[Tensor, "faces 3"], verts: int) -> SkinnedBody | None:
-    """The shipped body with exactly this topology, if there is one."""
+def _model_of(bodies: Bodies) -> SkinnedBody | None:
+    """The shipped body with exactly this topology, or the user's licensed one where it is there."""
+    count, faces = bodies.verts.shape[1], bodies.faces.cpu()
     for model in (open_body("small"), open_body("full")):
-        if model.verts.shape[0] == verts and torch.equal(model.faces, faces.cpu()):
+        if len(model.verts) == count and torch.equal(model.faces, faces):
             return model
-    return None
-
-
-def _users_model(bodies: Bodies) -> SkinnedBody | None:
-    """The skin of the user's licensed model, where its files are there and fit these bodies."""
     named = [] if bodies.pose is None else [(bodies.pose.model, bodies.pose.gender)]
-    count = bodies.verts.shape[1]
     for name, gender in [*named, *((n, "neutral") for n, k in KINDS.items() if k.verts == count)]:
         try:
             model = load_smpl(name, gender) if name in KINDS else None
         except InputError:
             continue
-        if model is not None and torch.equal(model.faces, bodies.faces.cpu()):
+        if model is not None and torch.equal(model.faces, faces):
             return model
     return None
 

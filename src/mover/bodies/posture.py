@@ -27,6 +27,12 @@ WINDOW = 0.1  # [s] before and after: long enough that trembling meshes are stil
 LONGEST_GAP = 1.0  # [s] between rows of a track that still give a speed
 
 
+Places = Float[Tensor, "bodies landmarks 3"]
+"""Of `LANDMARKS` [m]."""
+Chance = Float[Tensor, "bodies verts"]
+"""That a vertex touches something, and values like it."""
+
+
 @record
 class Postures:
     """Posture of each body; a body on the move between two of them has none."""
@@ -38,7 +44,7 @@ class Postures:
     """How far the trunk is tilted backwards from upright [rad]; negative: forwards."""
 
 
-def landmarks(bodies: Bodies, parts: BodyParts) -> Float[Tensor, "bodies landmarks 3"]:
+def landmarks(bodies: Bodies, parts: BodyParts) -> Places:
     """Places of `LANDMARKS` [m]: from the joints by name, else the middle of rings of vertices.
 
     NaN for a mesh of unknown topology without these joints.
@@ -51,7 +57,7 @@ def landmarks(bodies: Bodies, parts: BodyParts) -> Float[Tensor, "bodies landmar
     return bodies.verts[:, parts.rings].mean(2)
 
 
-def at(places: Float[Tensor, "bodies landmarks 3"], name: str) -> Float[Tensor, "bodies 3"]:
+def at(places: Places, name: str) -> Float[Tensor, "bodies 3"]:
     """One landmark [m]; `hips` and so on is the middle of left and right."""
     if name in LANDMARKS:
         return places[:, LANDMARKS.index(name)]
@@ -121,9 +127,7 @@ def postures(bodies: Bodies, parts: BodyParts, ground: Height | None = None) -> 
     return Postures(standing, sitting, lying, back)
 
 
-def _standing_hips(
-    places: Float[Tensor, "bodies landmarks 3"], bodies: Bodies
-) -> Float[Tensor, " bodies"]:
+def _standing_hips(places: Places, bodies: Bodies) -> Float[Tensor, " bodies"]:
     """Height of the hips over the ground when the person stands straight [m], one per track."""
     bones = [
         (at(places, f"{s}_{a}") - at(places, f"{s}_{b}")).norm(dim=-1)
@@ -137,7 +141,7 @@ def _standing_hips(
     return result
 
 
-def facing(places: Float[Tensor, "bodies landmarks 3"]) -> Float[Tensor, "bodies 3"]:
+def facing(places: Places) -> Float[Tensor, "bodies 3"]:
     """Level unit vector to the front of the pelvis and trunk; 0 where there is none."""
     left = _level(at(places, "left_hip") - at(places, "right_hip"))
     left = left + 0.5 * _level(at(places, "left_shoulder") - at(places, "right_shoulder"))
@@ -178,7 +182,7 @@ FLOATS = (0.08, 0.16)  # [m] of that point from the ground: on the floor, surely
 UNDERSIDE = 0.1  # [m] over the lowest point: where a body that lies on its front or side touches
 
 
-def touching(bodies: Bodies, parts: BodyParts, ground: Height) -> Float[Tensor, "bodies verts"]:
+def touching(bodies: Bodies, parts: BodyParts, ground: Height) -> Chance:
     """Chance that each vertex of people in the world (+y up) touches something.
 
     Raises:
@@ -207,11 +211,7 @@ def _ramp(value: Tensor, zero: float, one: float) -> Tensor:
     return torch.nan_to_num(share * share * (3 - 2 * share))
 
 
-def _flat(
-    reach: Float[Tensor, "bodies verts"],
-    chance: Float[Tensor, "bodies verts"],
-    layer: tuple[float, float],
-) -> Float[Tensor, "bodies verts"]:
+def _flat(reach: Chance, chance: Chance, layer: tuple[float, float]) -> Chance:
     """Leave only the layer [m] that reaches farthest [m]: furniture is flatter than bodies."""
     could = torch.where(chance > 0.5, reach, torch.full_like(reach, -torch.inf))
     farthest = could.topk(min(5, could.shape[1]), dim=1).values[:, -1:]
@@ -222,9 +222,9 @@ def _recline(
     bodies: Bodies,
     parts: BodyParts,
     pose: Postures,
-    places: Float[Tensor, "bodies landmarks 3"],
+    places: Places,
     normals: Float[Tensor, "bodies verts 3"],
-) -> Float[Tensor, "bodies verts"]:
+) -> Chance:
     """Leaning back in a seat: what faces backwards of the back and reaches far enough."""
     front, trunk = facing(places), at(places, "neck") - at(places, "hips")
     behind = _ramp(-torch.einsum("bvi,bi->bv", normals, front), *FACING)
@@ -236,9 +236,7 @@ def _recline(
     return _flat(reach, behind * members(parts, "back") * lean[:, None], LAYER)
 
 
-def _lie(
-    bodies: Bodies, parts: BodyParts, pose: Postures, down: Float[Tensor, "bodies verts"]
-) -> Float[Tensor, "bodies verts"]:
+def _lie(bodies: Bodies, parts: BodyParts, pose: Postures, down: Chance) -> Chance:
     """Lying on the back: back, seat and thighs; else whatever lies lowest and faces down."""
     rear = members(parts, "back", "seat", "left_thigh", "right_thigh")
     spine = members(parts, "back")
@@ -250,12 +248,8 @@ def _lie(
 
 
 def _rest_arms(
-    bodies: Bodies,
-    parts: BodyParts,
-    places: Float[Tensor, "bodies landmarks 3"],
-    down: Float[Tensor, "bodies verts"],
-    ground: Height,
-) -> Float[Tensor, "bodies verts"]:
+    bodies: Bodies, parts: BodyParts, places: Places, down: Chance, ground: Height
+) -> Chance:
     """Hands and forearms at rest on a surface, not on the own lap: what faces down of them."""
     chance = torch.zeros_like(down)
     for name in ("left_palm", "right_palm", "left_forearm", "right_forearm"):
@@ -276,9 +270,7 @@ def _rest_arms(
     return chance
 
 
-def from_lap(
-    point: Float[Tensor, "bodies 3"], places: Float[Tensor, "bodies landmarks 3"]
-) -> Float[Tensor, " bodies"]:
+def from_lap(point: Float[Tensor, "bodies 3"], places: Places) -> Float[Tensor, " bodies"]:
     """Distance to the nearer of the own thighs' middle lines [m]."""
     ways: list[Tensor] = []
     for side in SIDES:
@@ -290,7 +282,7 @@ def from_lap(
     return torch.minimum(*ways)
 
 
-def _stand(bodies: Bodies, parts: BodyParts, ground: Height) -> Float[Tensor, "bodies verts"]:
+def _stand(bodies: Bodies, parts: BodyParts, ground: Height) -> Chance:
     """Soles: hardly moving, and as low as the body reaches, which is about the ground.
 
     A body whose depth is wrong floats or sinks by some centimetres: its own lowest point shows

@@ -29,6 +29,12 @@ FLAT = "flat_hand_mean"
 """Key of `BodyPose.extra`: not zero where hands are turned from flat, not from the mean hand."""
 
 
+Posed = tuple[Float[Tensor, "bodies verts 3"], Float[Tensor, "bodies joints 3"]]
+"""Vertices and joints of bodies [m]."""
+Turns = Float[Tensor, "bodies joints 3 3"]
+"""Rotations of the joints."""
+
+
 @record
 class Hands:
     """The space of hand poses; the first axis is left, right."""
@@ -79,9 +85,7 @@ class SkinnedBody:
     face: FacePoints | None = None
     gender: str = "neutral"
 
-    def posed(
-        self, pose: BodyPose
-    ) -> tuple[Float[Tensor, "bodies verts 3"], Float[Tensor, "bodies joints 3"]]:
+    def posed(self, pose: BodyPose) -> Posed:
         """Vertices and joints of people in these poses [m], as the smplx package gives them.
 
         Hands may be 45 angles or fewer principal components; both are added to the mean hand
@@ -96,10 +100,10 @@ class SkinnedBody:
 
     def rest(
         self,
-        turns: Float[Tensor, "bodies joints 3 3"],
+        turns: Turns,
         betas: Float[Tensor, "bodies shape"],
         face: Float[Tensor, "bodies expression"] | None,
-    ) -> tuple[Float[Tensor, "bodies verts 3"], Float[Tensor, "bodies joints 3"]]:
+    ) -> Posed:
         """Rest shape and joints with the correctives of pose and expression [m].
 
         Raises:
@@ -185,34 +189,25 @@ def with_full_hands(model: SkinnedBody, pose: BodyPose) -> BodyPose:
 
 def skinned(
     model: SkinnedBody,
-    turns: Float[Tensor, "bodies joints 3 3"],
+    turns: Turns,
     verts: Float[Tensor, "bodies verts 3"],
     joints: Float[Tensor, "bodies joints 3"],
     transl: Float[Tensor, "bodies 3"],
-) -> tuple[Float[Tensor, "bodies verts 3"], Float[Tensor, "bodies joints 3"]]:
+) -> Posed:
     """Vertices and joints in a pose, from rest shapes and the rotation of each joint [m]."""
     world, places = pose_joints(model, turns, joints)
     offset = places - torch.einsum("bjik,bjk->bji", world, joints)
     moves = torch.cat([world, offset[..., None]], -1)
     some = (x.split(AT_ONCE) for x in (moves, verts, transl))
-    weights = model.weights.to(moves)
-    skin = [_blended(weights, *few) for few in zip(*some, strict=True)]
+    weights, skin = model.weights.to(moves), list[Tensor]()
+    for move, rest, shift in zip(*some, strict=True):
+        bodies, count = move.shape[:2]
+        flat = move.permute(1, 3, 0, 2).reshape(count, bodies * 12)
+        x, y, z, put = (weights @ flat).view(-1, 4, bodies, 3).unbind(1)
+        at = rest.transpose(0, 1).unsqueeze(-1)
+        moved = x * at[:, :, 0] + y * at[:, :, 1] + z * at[:, :, 2] + put + shift
+        skin.append(moved.transpose(0, 1).contiguous())
     return torch.cat(skin), places + transl[:, None]
-
-
-def _blended(
-    weights: Float[Tensor, "verts joints"],
-    moves: Float[Tensor, "bodies joints 3 4"],
-    verts: Float[Tensor, "bodies verts 3"],
-    transl: Float[Tensor, "bodies 3"],
-) -> Float[Tensor, "bodies verts 3"]:
-    """The rest shape of a few bodies, moved with the joints [m]."""
-    bodies, count = moves.shape[:2]
-    flat = moves.permute(1, 3, 0, 2).reshape(count, bodies * 12)
-    x, y, z, put = (weights @ flat).view(-1, 4, bodies, 3).unbind(1)
-    at = verts.transpose(0, 1).unsqueeze(-1)
-    moved = x * at[:, :, 0] + y * at[:, :, 1] + z * at[:, :, 2] + put + transl
-    return moved.transpose(0, 1).contiguous()
 
 
 ANGLES = {
@@ -251,9 +246,7 @@ def angles_of(model: SkinnedBody, pose: BodyPose) -> Float[Tensor, "bodies joint
     return torch.cat(rows, -1).reshape(bodies, -1, 3)
 
 
-def shaped(
-    model: SkinnedBody, betas: Float[Tensor, "bodies shape"]
-) -> tuple[Float[Tensor, "bodies verts 3"], Float[Tensor, "bodies joints 3"]]:
+def shaped(model: SkinnedBody, betas: Float[Tensor, "bodies shape"]) -> Posed:
     """Rest shape and joints of each person [m]; shape coefficients that are not given are 0.
 
     Raises:
@@ -273,10 +266,8 @@ def shaped(
 
 
 def pose_joints(
-    model: SkinnedBody,
-    turns: Float[Tensor, "bodies joints 3 3"],
-    joints: Float[Tensor, "bodies joints 3"],
-) -> tuple[Float[Tensor, "bodies joints 3 3"], Float[Tensor, "bodies joints 3"]]:
+    model: SkinnedBody, turns: Turns, joints: Float[Tensor, "bodies joints 3"]
+) -> tuple[Turns, Float[Tensor, "bodies joints 3"]]:
     """World rotation (from the rest shape) and position of each joint, level by level."""
     tpose = model.tpose.to(turns)
     parents = torch.tensor([max(p, 0) for p in model.parents], device=joints.device)

@@ -44,12 +44,9 @@ class TransferMatrix:
     mix: Float[Tensor, "target source"]
 
 
-def find_matrix(folder: Path | None = None) -> Path | None:
-    """The user's official file, None if there is none.
-
-    Looked for in `folder`, by default the one of `MOVER_BODY_MODELS`, and in its `transfer_data`.
-    """
-    given = folder or os.environ.get(FOLDER)
+def find_matrix() -> Path | None:
+    """The user's official file in the folder of `MOVER_BODY_MODELS` or its `transfer_data`."""
+    given = os.environ.get(FOLDER)
     places = ("", "transfer_data", "transfer") if given else ()
     tried = (Path(given or "") / place / FILE for place in places)
     return next((path for path in tried if path.is_file()), None)

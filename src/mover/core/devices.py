@@ -40,9 +40,7 @@ def named(device: torch.device) -> str:
 
 def constant(values: Any, like: Tensor) -> Tensor:  # noqa: ANN401
     """These values with the type and on the device of `like`: always the same tensor; copy it."""
-    return _held(values, like.dtype, like.device)
+    return _made(values, dtype=like.dtype, device=like.device)
 
 
-@cache
-def _held(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:  # noqa: ANN401
-    return torch.tensor(values, dtype=dtype, device=device)
+_made = cache(torch.tensor)

@@ -61,7 +61,12 @@ class Run:
         name, device, path = self._named(fn, inputs, config)
         start = time.perf_counter()
         kind = typing.get_type_hints(fn)["return"]
-        output: Out | None = _stored(kind, path)
+        output: Out | None = None
+        if path.with_suffix(".json").exists():
+            try:
+                output = records.load(kind, path)
+            except InputError as error:
+                log.warning("warning: %s; it is computed again", error)
         kept = output is not None
         if output is None and device == CPU:
             output = fn(inputs, config, self.observe)
@@ -91,17 +96,6 @@ class Run:
         package = (getattr(fn, "__module__", None) or "").partition(".")[0]
         key = records.fingerprint(inputs, config, sources(package), *where)
         return name, device, self.folder / "stages" / name / key
-
-
-def _stored(kind: type[Out], path: Path) -> Out | None:
-    """A finished output; None where there is none, or none that can be trusted, which is said."""
-    if not path.with_suffix(".json").exists():
-        return None
-    try:
-        return records.load(kind, path)
-    except InputError as error:
-        log.warning("warning: %s; it is computed again", error)
-        return None
 
 
 @functools.cache

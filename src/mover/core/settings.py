@@ -12,13 +12,12 @@ import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from tyro.constructors import PrimitiveConstructorSpec
 
 from mover.core.errors import InputError
 
-T = TypeVar("T")
 MOST_SHOWN = 60  # letters of a wrong value in a message
 UNIONS = (Union, types.UnionType)
 WORDS = {bool: "true or false", str: "text", Path: "a path", types.NoneType: "nothing"}
@@ -45,16 +44,6 @@ class Range(PrimitiveConstructorSpec[Any]):
         return self.low <= typing.cast(float, value) <= self.high
 
 
-def int_in(low: int, high: int) -> Range:
-    """The range of a whole number."""
-    return _range(int, low, high)
-
-
-def float_in(low: float, high: float) -> Range:
-    """The range of a number; it may end at infinity."""
-    return _range(float, low, high)
-
-
 def _range(kind: type[int] | type[float], low: float, high: float) -> Range:
     return Range(
         nargs=1,
@@ -64,6 +53,12 @@ def _range(kind: type[int] | type[float], low: float, high: float) -> Range:
         str_from_instance=lambda value: [str(value)],
         low=low, high=high, kind=kind,
     )  # fmt: skip
+
+
+int_in = functools.partial(_range, int)
+"""The range of a whole number."""
+float_in = functools.partial(_range, float)
+"""The range of a number; it may end at infinity."""
 
 
 def _short(number: float) -> str:
@@ -79,8 +74,6 @@ Metres = Annotated[float, float_in(0, 100)]
 Seconds = Annotated[float, float_in(0, 1e6)]
 Rate = Annotated[float, float_in(1e-3, 1e4)]
 """Of frames a second."""
-Pixels = Annotated[int, int_in(1, 32768)]
-"""Along a side of a picture."""
 Count = Annotated[int, int_in(1, 1_000_000)]
 Steps = Annotated[int, int_in(0, 1_000_000)]
 """Of a descent, or rounds of one; 0: none."""
@@ -108,15 +101,6 @@ def check_settings(settings: object, name: str) -> None:
     for key, hint in settings_of(type(settings)).items():
         flat = any(getattr(one, "name", None) == "" for one in getattr(hint, "__metadata__", ()))
         _check(getattr(settings, key), hint, name if flat else _joined(name, key))
-
-
-def read_settings(kind: type[T], tree: object, name: str) -> T:
-    """Settings from plain JSON values, checked; what is missing keeps its default.
-
-    Raises:
-        InputError: If one is unknown, of a wrong type, or out of its range.
-    """
-    return typing.cast(T, _built(kind, tree, name))
 
 
 def _joined(name: str, key: str) -> str:
@@ -158,8 +142,14 @@ def _wrong(value: Any, hint: Any, name: str) -> str:  # noqa: ANN401
     return "" if hint not in WORDS or isinstance(value, hint) else WORDS[hint]
 
 
-def _built(hint: Any, tree: Any, name: str) -> Any:  # noqa: ANN401
-    """A value of plain JSON values, checked before a record is built of it."""
+def read_settings(hint: Any, tree: Any, name: str) -> Any:  # noqa: ANN401
+    """Settings of this type from plain JSON values, checked before a record is built of them.
+
+    What is missing keeps its default.
+
+    Raises:
+        InputError: If one is unknown, of a wrong type, or out of its range.
+    """
     args = get_args(hint)
     kinds = [one for one in (args if get_origin(hint) in UNIONS else (hint,))
              if isinstance(one, type) and dataclasses.is_dataclass(one)]  # fmt: skip
@@ -170,10 +160,10 @@ def _built(hint: Any, tree: Any, name: str) -> Any:  # noqa: ANN401
             if key not in fields:
                 known = ", ".join(fields)
                 raise InputError(f"{_joined(name, key)}: is no setting, expected one of {known}")
-        return kind(**{k: _built(fields[k], v, _joined(name, k)) for k, v in tree.items()})
+        return kind(**{k: read_settings(fields[k], v, _joined(name, k)) for k, v in tree.items()})
     if isinstance(tree, list):
         items = args[:1] * len(tree) if Ellipsis in args else (*args, *[Any] * len(tree))
         pairs = enumerate(zip(items, tree, strict=False))
-        tree = tuple(_built(kind, one, f"{name}[{i}]") for i, (kind, one) in pairs)
+        tree = tuple(read_settings(kind, one, f"{name}[{i}]") for i, (kind, one) in pairs)
     _check(tree, hint, name)
     return tree

@@ -34,10 +34,8 @@ class Standing:
 class Twins:
     """Points of the bodies and of their true counterparts; None where they do not correspond."""
 
-    verts: Float[Tensor, "bodies verts 3"] | None
-    true_verts: Float[Tensor, "bodies verts 3"] | None
-    joints: Float[Tensor, "bodies joints 3"] | None
-    true_joints: Float[Tensor, "bodies joints 3"] | None
+    verts: tuple[Float[Tensor, "bodies verts 3"], Float[Tensor, "bodies verts 3"]] | None
+    joints: tuple[Float[Tensor, "bodies joints 3"], Float[Tensor, "bodies joints 3"]] | None
 
 
 def ground_penetration_frequency(standing: Standing) -> float:
@@ -51,26 +49,6 @@ def ground_penetration_distance(standing: Standing) -> float:
     return float(-standing.heights[below].mean()) if bool(below.any()) else 0.0
 
 
-def pje(twins: Twins) -> float | None:
-    """Mean distance of the joints [m], without any alignment."""
-    return _distance(twins.joints, twins.true_joints)
-
-
-def v2v(twins: Twins) -> float | None:
-    """Mean distance of corresponding vertices [m], without any alignment."""
-    return _distance(twins.verts, twins.true_verts)
-
-
-def p_pje(twins: Twins) -> float | None:
-    """Mean distance of the joints [m] after the best similarity transform of each body."""
-    return _distance(twins.joints, twins.true_joints, aligned=True)
-
-
-def p_v2v(twins: Twins) -> float | None:
-    """Mean distance of the vertices [m] after the best similarity transform of each body."""
-    return _distance(twins.verts, twins.true_verts, aligned=True)
-
-
 GROUND_METRICS: dict[str, Metric[Standing]] = {
     "ground_penetration_frequency": Metric(
         "Soles under the floor", "share", 0.0, ground_penetration_frequency
@@ -80,11 +58,17 @@ GROUND_METRICS: dict[str, Metric[Standing]] = {
     ),
 }
 POSE_METRICS: dict[str, Metric[Twins]] = {
-    "pje": Metric("Error of the joints", "m", 0.0, pje),
-    "v2v": Metric("Error of the body's surface", "m", 0.0, v2v),
-    "p_pje": Metric("Error of the joints, aligned", "m", 0.0, p_pje),
-    "p_v2v": Metric("Error of the body's surface, aligned", "m", 0.0, p_v2v),
+    "pje": Metric("Error of the joints", "m", 0.0, lambda t: _distance(t.joints)),
+    "v2v": Metric("Error of the body's surface", "m", 0.0, lambda t: _distance(t.verts)),
+    "p_pje": Metric(
+        "Error of the joints, aligned", "m", 0.0, lambda t: _distance(t.joints, aligned=True)
+    ),
+    "p_v2v": Metric(
+        "Error of the body's surface, aligned", "m", 0.0, lambda t: _distance(t.verts, aligned=True)
+    ),
 }
+"""Mean distances of corresponding points [m], without any alignment; aligned: after the best
+similarity transform of each body."""
 
 
 def soles_of(bodies: Bodies, camera: Camera) -> Int[Tensor, " soles"]:
@@ -116,13 +100,13 @@ def gather_twins(bodies: Bodies, truth: Bodies) -> Twins | None:
     if len(rows) == 0:
         return None
     same = bodies.verts.shape[1] == truth.verts.shape[1]
-    verts = (bodies.verts[rows], truth.verts[true_rows]) if same else (None, None)
+    verts = (bodies.verts[rows], truth.verts[true_rows]) if same else None
     common = [name for name in bodies.joint_names if name in truth.joint_names]
     common = [name for name in common if name in BODY] or common  # of the body, where there are any
     if not common or bodies.joints is None or truth.joints is None:
-        return Twins(*verts, None, None)
+        return Twins(verts, None)
     ours, theirs = ([b.joint_names.index(n) for n in common] for b in (bodies, truth))
-    return Twins(*verts, bodies.joints[rows][:, ours], truth.joints[true_rows][:, theirs])
+    return Twins(verts, (bodies.joints[rows][:, ours], truth.joints[true_rows][:, theirs]))
 
 
 def procrustes(
@@ -148,14 +132,12 @@ def _keys(bodies: Bodies) -> list[tuple[int, int]]:
 AT_ONCE = 16  # bodies that are aligned together: what fits a processor's cache
 
 
-def _distance(
-    points: Tensor | None, target: Tensor | None, *, aligned: bool = False
-) -> float | None:
+def _distance(pair: tuple[Tensor, Tensor] | None, *, aligned: bool = False) -> float | None:
     """Mean distance of corresponding points [m], as they are or after each body's similarity."""
-    if points is None or target is None:
+    if pair is None:
         return None
-    total, count = 0.0, points[..., 0].numel()
-    for some, there in zip(points.split(AT_ONCE), target.split(AT_ONCE), strict=True):
+    total, count = 0.0, pair[0][..., 0].numel()
+    for some, there in zip(*(points.split(AT_ONCE) for points in pair), strict=True):
         moved = procrustes(some, there) if aligned else some
         total += float((moved - there).norm(dim=-1).double().sum())
     return total / count if count else math.nan

@@ -17,7 +17,9 @@ from mover.bodies.parts import SOLES, members, parts_of
 from mover.core.records import record
 from mover.core.run import Run
 from mover.core.settings import Count, Metres, int_in
-from mover.core.types import Bodies, Mesh, Scene
+from mover.core.types import Bodies, Scene
+from mover.evaluate import contact
+from mover.evaluate import scene as compare
 from mover.evaluate.bodies import (
     GROUND_METRICS,
     POSE_METRICS,
@@ -25,33 +27,6 @@ from mover.evaluate.bodies import (
     feet_places,
     gather_twins,
     soles_of,
-)
-from mover.evaluate.contact import (
-    TOUCH_METRICS,
-    Furniture,
-    Touch,
-    TrueTouch,
-    close_meshes,
-    furniture_of,
-    gather_touch,
-    gather_truth,
-)
-from mover.evaluate.scene import (
-    CAMERA_METRICS,
-    HARM_METRICS,
-    OBJECT_METRICS,
-    SCENE_METRICS,
-    SIDES,
-    Metric,
-    Pair,
-    Sight,
-    Together,
-    doubled,
-    means_of,
-    measure,
-    measure_objects,
-    pairs,
-    unmatched,
 )
 from mover.evaluate.stability import PHYSICS_METRICS, lacking, settle
 from mover.geometry.placement import StandingMesh
@@ -61,12 +36,12 @@ from mover.io.capture.camera_file import camera_of
 from mover.io.capture.scene_file import read_scene
 from mover.io.files.fields import read_json, write_json
 
-METRICS: dict[str, Metric[Any]] = {
-    **OBJECT_METRICS,
-    **HARM_METRICS,
-    **SCENE_METRICS,
-    **TOUCH_METRICS,
-    **CAMERA_METRICS,
+METRICS: dict[str, compare.Metric[Any]] = {
+    **compare.OBJECT_METRICS,
+    **compare.HARM_METRICS,
+    **compare.SCENE_METRICS,
+    **contact.TOUCH_METRICS,
+    **compare.CAMERA_METRICS,
     **GROUND_METRICS,
     **POSE_METRICS,
 }
@@ -102,8 +77,6 @@ class EvaluatedBodies:
     initial: Bodies | None
     result: Bodies | None
     truth: Bodies | None
-    touch: TrueTouch | None = None
-    """The true people beside the true furniture (`touch_in_truth`); None: it is measured."""
     named: Float[Tensor, "bodies verts"] | None = None
     """Chance that a vertex of `result` touches something (POSA), for feet that are contacts."""
 
@@ -126,7 +99,7 @@ def evaluate(
     truth: Scene,
     bodies: EvaluatedBodies | None = None,
     config: EvaluateConfig | None = None,
-    sides: Sequence[str] = SIDES,
+    sides: Sequence[str] = compare.SIDES,
 ) -> dict[str, Any]:
     """Measure a scene before and after against the truth.
 
@@ -144,24 +117,30 @@ def evaluate(
     config = config or EvaluateConfig()
     bodies = bodies or EvaluatedBodies(None, None, None)
     before, after, true = _populate((initial, result, truth), bodies)
-    both = dict(zip(SIDES, (before, after), strict=True))
-    asked = {key: both[key] for key in SIDES if key in sides}
+    both = dict(zip(compare.SIDES, (before, after), strict=True))
+    asked = {key: both[key] for key in compare.SIDES if key in sides}
     scenes = before.scene, after.scene, true.scene
-    objects = measure_objects(scenes, sides, config.samples, config.by_place, config.boxes)
-    touch = bodies.touch or _true_touch(true, after.bodies or before.bodies, config)
-    matched = dict(zip(SIDES, pairs(*scenes, config.by_place), strict=True))
+    matched = dict(zip(compare.SIDES, compare.pairs(*scenes, config.by_place), strict=True))
+    objects = compare.measure_objects(scenes, matched, sides, config.samples, config.boxes)
+    people, touch = after.bodies or before.bodies, None
+    if true.bodies is not None and people is not None:
+        touch = contact.gather_truth(
+            true.bodies, true.furniture, people, config.bodies, config.reach
+        )
 
     def of(key: str) -> dict[str, float]:
         judged = asked[key]
         found, camera = matched[key], judged.scene.camera
         known = [t for t in true.scene.objects if t.id in found]
-        there = tuple(Pair(found[t.id], camera, t, true.scene.camera, 0) for t in known)
-        together = Together(there, len(true.scene.objects) - len(there))
-        values = means_of(objects, key) | measure(SCENE_METRICS, together)
-        values |= measure(CAMERA_METRICS, Sight(judged.scene, true.scene))
+        there = tuple(compare.Pair(found[t.id], camera, t, true.scene.camera, 0) for t in known)
+        together = compare.Together(there, len(true.scene.objects) - len(there))
+        values = compare.means_of(objects, key) | compare.measure(compare.SCENE_METRICS, together)
+        values |= compare.measure(compare.CAMERA_METRICS, compare.Sight(judged.scene, true.scene))
         if judged.bodies is None:
             return values
-        near = gather_touch(judged.bodies, judged.furniture, touch, config.bodies, config.reach)
+        near = contact.gather_touch(
+            judged.bodies, judged.furniture, touch, config.bodies, config.reach
+        )
         feet = judged.bodies.verts[:, judged.soles] if len(judged.soles) else None
         if config.feet == "contacts":
             named = bodies.named if judged is after else None
@@ -171,14 +150,6 @@ def evaluate(
         )
 
     return dict(zip(asked, mapped(of, list(asked)), strict=True)) | {"objects": objects}
-
-
-def touch_in_truth(
-    truth: Scene, bodies: EvaluatedBodies, config: EvaluateConfig
-) -> TrueTouch | None:
-    """The true people beside the true furniture, of the bodies that are judged; None: no truth."""
-    true = _populate((truth, truth, truth), EvaluatedBodies(None, None, bodies.truth))[-1]
-    return _true_touch(true, bodies.result or bodies.initial, config)
 
 
 def evaluate_folder(
@@ -196,12 +167,12 @@ def evaluate_folder(
     initial, result = read_scene(out / "initial.json"), read_scene(out / "scene.json")
     true = read_truth(truth)
     metrics = evaluate(initial, result, true, bodies, config)
-    metrics["unmatched"] = unmatched(initial, result, true)
+    metrics["unmatched"] = compare.unmatched(initial, result, true)
     if physics and (missing := lacking()) is not None:
         metrics["not_measured"] = dict.fromkeys(PHYSICS_METRICS, missing)
     elif physics:
-        for side, scene in zip(SIDES, (initial, result), strict=True):
-            metrics[side] |= measure(PHYSICS_METRICS, settle(scene, Run(out)))
+        for side, scene in zip(compare.SIDES, (initial, result), strict=True):
+            metrics[side] |= compare.measure(PHYSICS_METRICS, settle(scene, Run(out)))
     write_json(metrics, out / "metrics.json")
     return metrics
 
@@ -236,7 +207,7 @@ def table(metrics: Mapping[str, Any], shown: Sequence[str] | None = None) -> str
 
 
 def evaluate_people(
-    bodies: Bodies, floor: float | None, furniture: Furniture, truth: Bodies | None = None
+    bodies: Bodies, floor: float | None, furniture: contact.Furniture, truth: Bodies | None = None
 ) -> dict[str, float]:
     """How people of a room fit its floor [m] and closed furniture, and how wrong they are.
 
@@ -245,24 +216,24 @@ def evaluate_people(
     soles = members(parts_of(bodies), *SOLES)
     feet = bodies.verts[:, soles] if bool(soles.any()) else None
     config = EvaluateConfig()
-    near = gather_touch(bodies, furniture, None, config.bodies, config.reach)
+    near = contact.gather_touch(bodies, furniture, None, config.bodies, config.reach)
     return _people(bodies, near, feet, floor, config.ground_tolerance, truth)
 
 
 def _people(
     bodies: Bodies,
-    near: Touch,
+    near: contact.Touch,
     feet: Float[Tensor, "bodies points 3"] | None,
     floor: float | None,
     tolerance: float,
     truth: Bodies | None,
 ) -> dict[str, float]:
     """The metrics of a scene's people; what they or the truth do not give is left out."""
-    values = measure(TOUCH_METRICS, near)
+    values = compare.measure(contact.TOUCH_METRICS, near)
     if floor is not None and feet is not None:
-        values |= measure(GROUND_METRICS, Standing(feet[..., 1] - floor, tolerance))
+        values |= compare.measure(GROUND_METRICS, Standing(feet[..., 1] - floor, tolerance))
     twins = None if truth is None else gather_twins(bodies, truth)
-    return values | ({} if twins is None else measure(POSE_METRICS, twins))
+    return values | ({} if twins is None else compare.measure(POSE_METRICS, twins))
 
 
 def _cell(values: Mapping[str, float], name: str) -> str:
@@ -274,23 +245,16 @@ def _populate(scenes: tuple[Scene, Scene, Scene], people: EvaluatedBodies) -> li
     rows = [
         b if b and len(b.frame) else None for b in (people.initial, people.result, people.truth)
     ]
-    pairs = list(zip(scenes, rows, strict=True))
-    closed = close_meshes(item for scene, b in pairs if b is not None for item in scene.objects)
-    return [_populated(scene, b, closed) for scene, b in pairs]
-
-
-def _populated(scene: Scene, bodies: Bodies | None, closed: Mapping[str, Mesh]) -> _Populated:
-    if bodies is None:
-        return _Populated(doubled(scene), None, torch.zeros(0, dtype=torch.long), ())
-    soles = soles_of(bodies, scene.camera)
-    furniture = doubled(tuple(furniture_of(scene.objects, closed)))
-    people = in_world(doubled(bodies), scene.camera)
-    return _Populated(doubled(scene), people, soles, furniture)
-
-
-def _true_touch(
-    truth: _Populated, judged: Bodies | None, config: EvaluateConfig
-) -> TrueTouch | None:
-    if truth.bodies is None or judged is None:
-        return None
-    return gather_truth(truth.bodies, truth.furniture, judged, config.bodies, config.reach)
+    peopled = list(zip(scenes, rows, strict=True))
+    closed = contact.close_meshes(
+        item for scene, b in peopled if b is not None for item in scene.objects
+    )
+    found: list[_Populated] = []
+    for scene, b in peopled:
+        soles, furniture = torch.zeros(0, dtype=torch.long), ()
+        if b is not None:
+            soles = soles_of(b, scene.camera)
+            furniture = compare.doubled(tuple(contact.furniture_of(scene.objects, closed)))
+        world = None if b is None else in_world(compare.doubled(b), scene.camera)
+        found.append(_Populated(compare.doubled(scene), world, soles, furniture))
+    return found

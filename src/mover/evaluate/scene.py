@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from mover.core.records import map_tensors, record
@@ -193,25 +193,19 @@ def image_box(
     None: nothing of the mesh is on the image.
     """
     mesh = shape(item)
-    visible = _in_front(to_camera(mesh.verts, camera.R_cam_world), mesh.faces)
+    faces, points_cam = mesh.faces, to_camera(mesh.verts, camera.R_cam_world)
+    ends = points_cam[torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])]
+    depth = ends[..., 2]
+    cut = (depth[:, 0] < NEAR) != (depth[:, 1] < NEAR)  # edges are cut where they come nearer
+    start, stop = ends[cut].unbind(1)
+    share = (NEAR - start[:, 2:]) / (stop[:, 2:] - start[:, 2:])
+    visible = torch.cat([ends[depth >= NEAR], start + share * (stop - start)])
     if len(visible) == 0:
         return None
     size = torch.tensor([camera.width, camera.height]).to(visible)
     pixels = project(visible, camera.K) / size
     low, high = pixels.amin(0).clamp(0, 1), pixels.amax(0).clamp(0, 1)
     return torch.cat([low, high]) if bool((low < high).all()) else None
-
-
-def _in_front(
-    points_cam: Float[Tensor, "verts 3"], faces: Int[Tensor, "faces 3"]
-) -> Float[Tensor, "visible 3"]:
-    """Corners of the triangles, cut where they come nearer than `NEAR`."""
-    ends = points_cam[torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])]
-    depth = ends[..., 2]
-    cut = (depth[:, 0] < NEAR) != (depth[:, 1] < NEAR)
-    start, stop = ends[cut].unbind(1)
-    share = (NEAR - start[:, 2:]) / (stop[:, 2:] - start[:, 2:])
-    return torch.cat([ends[depth >= NEAR], start + share * (stop - start)])
 
 
 def _assign(
@@ -261,22 +255,21 @@ def unmatched(
 
 def measure_objects(
     scenes: tuple[Scene, Scene, Scene],
+    found: Mapping[str, Mapping[str, SceneObject]],
     sides: Sequence[str],
     samples: int,
-    by_place: bool,
     boxes: bool = False,
 ) -> list[dict[str, Any]]:
     """Each true object in the initial scene and in the result, as far as they are asked for.
 
     Args:
         scenes: The initial one, the result and the truth.
+        found: What stands for the true objects on both `SIDES`, as `pairs` has it.
         sides: Some of `SIDES`.
         samples: Points on each true surface.
-        by_place: Whether objects that bear no true name are paired by place.
         boxes: Whether the truth is boxes without meshes.
     """
     initial, result, truth = scenes
-    found = dict(zip(SIDES, pairs(initial, result, truth, by_place), strict=True))
     cameras = {"initial": initial.camera, "result": result.camera}
 
     def of(side: str, true: SceneObject) -> dict[str, float]:
@@ -338,28 +331,25 @@ class _Similarity:
 
 
 def iou3d_aligned(scene: Together) -> float | None:
-    """Mean overlap of the boxes after the similarity that brings most centres together."""
+    """Mean overlap of the boxes after the similarity that brings most centres together.
+
+    It is found by reweighted least squares.
+    """
     if len(scene.pairs) < FEWEST:
         return None
     ours = [doubled(box_of(pair.estimate)) for pair in scene.pairs]
     true = [doubled(box_of(pair.truth)) for pair in scene.pairs]
-    by = _fitted(*(torch.stack([box.center for box in boxes]) for boxes in (ours, true)))
+    centres, aims = (torch.stack([box.center for box in boxes]) for boxes in (ours, true))
+    by = _weighted(centres, aims, torch.ones_like(centres[:, 0]))
+    for _ in range(ROUNDS):  # to the least sum of distances
+        there = by.scale * (centres @ rot_y(by.yaw).mT) + by.away
+        by = _weighted(centres, aims, 1 / (there - aims).norm(dim=-1).clamp_min(CLOSE))
     total = 0.0
     for box, aim in zip(ours, true, strict=True):
         centre = by.scale * (rot_y(by.yaw) @ box.center) + by.away
         carried = Box(centre, by.scale * box.size, box.yaw + by.yaw)
         total += float(box_iou(thick(carried), thick(aim)))
     return total / (len(scene.pairs) + scene.missing)
-
-
-def _fitted(ours: Float[Tensor, "n 3"], true: Float[Tensor, "n 3"]) -> _Similarity:
-    """The similarity with the least sum of distances (reweighted least squares)."""
-    weight = torch.ones_like(ours[:, 0])
-    found = _weighted(ours, true, weight)
-    for _ in range(ROUNDS):
-        there = found.scale * (ours @ rot_y(found.yaw).mT) + found.away
-        found = _weighted(ours, true, 1 / (there - true).norm(dim=-1).clamp_min(CLOSE))
-    return found
 
 
 def _weighted(

@@ -68,24 +68,21 @@ def settle(scene: Scene, run: Run, seconds: float = SECONDS) -> tuple[Settled, .
     start = [_state(data, solid) for solid in solids]
     for _ in range(round(seconds / model.opt.timestep)):
         mujoco.mj_step(model, data)
-    return tuple(
-        _compared(solid, before, _state(data, solid))
-        for solid, before in zip(solids, start, strict=True)
-    )
+    found: list[Settled] = []
+    for solid, before in zip(solids, start, strict=True):
+        after = _state(data, solid)
+        verts = torch.cat([hull.verts for hull in solid.hulls]).numpy()
+        centre = (verts.min(0) + verts.max(0)) / 2
+        way = (after[1] @ centre + after[0]) - (before[1] @ centre + before[0])
+        cosine = float(np.clip((np.trace(after[1] @ before[1].T) - 1) / 2, -1, 1))
+        moved = float(np.linalg.norm(way))
+        found.append(Settled(solid.id, moved, math.acos(cosine), not solid.free))
+    return tuple(found)
 
 
 def _state(data: Any, solid: Solid) -> State:  # noqa: ANN401
     body = data.body(body_name(solid))
     return np.array(body.xpos), np.array(body.xmat).reshape(3, 3)
-
-
-def _compared(solid: Solid, start: State, end: State) -> Settled:
-    verts = torch.cat([hull.verts for hull in solid.hulls]).numpy()
-    centre = (verts.min(0) + verts.max(0)) / 2
-    before, after = (turn @ centre + origin for origin, turn in (start, end))
-    cosine = np.clip((np.trace(end[1] @ start[1].T) - 1) / 2, -1, 1)
-    moved = float(np.linalg.norm(after - before))
-    return Settled(solid.id, moved, math.acos(float(cosine)), not solid.free)
 
 
 def stable_share(found: Sequence[Settled]) -> float | None:

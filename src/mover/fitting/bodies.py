@@ -12,30 +12,13 @@ from mover.bodies.skinning import FLAT, SkinnedBody, growth_of, shaped, widths_o
 from mover.core.observe import Energy, Observer, Step, silent
 from mover.core.records import record, rows_of
 from mover.core.types import Bodies, BodyPose, Camera, Keypoints, rows_by_person
-from mover.fitting import ground, tracks
+from mover.fitting import ground, tracks, unknowns
 from mover.fitting.config import FitConfig, Stage
 from mover.fitting.energy import FitState
 from mover.fitting.noise import Bias, at_most, bias_of, noise_of, noisy, without
 from mover.fitting.prior import encoded
 from mover.fitting.priors import UNKNOWN, kind_of, lasting_of, stature_of
 from mover.fitting.start import begin, begin_from
-from mover.fitting.unknowns import (
-    ANGLES,
-    EVERYTHING,
-    HAND,
-    OF_ROWS,
-    Frame,
-    PosePrior,
-    Rig,
-    Unknowns,
-    grown,
-    hand_angles,
-    log_depth,
-    pelvis_of,
-    rig_of,
-    solve,
-    turns_of,
-)
 from mover.geometry.rotations import rotation_vectors
 
 SHAPES = 10
@@ -53,7 +36,7 @@ class FitInputs:
     model: SkinnedBody
     start: Bodies | None = None
     """Bodies of another tool in the camera frame, with parameters."""
-    prior: PosePrior = ANGLES
+    prior: unknowns.PosePrior = unknowns.ANGLES
     ground: float | None = None
     """Height of the floor in the camera's world [m], where it is known: no person goes below it."""
     heights: tuple[float, ...] = ()
@@ -84,7 +67,7 @@ def fit_bodies(
     rows, warnings = tracks.usable_rows(inputs.keypoints, config)
     stature = stature_of(model, inputs.heights, inputs.keypoints.person, rows)
     some = rows_of(inputs.keypoints, rows)
-    rig = rig_of(model, some.layout, tracks.seen_at_all(some, config))
+    rig = unknowns.rig_of(model, some.layout, tracks.seen_at_all(some, config))
     seen = dataclasses.replace(tracks.seen_of(some, rig, camera, config), floor=inputs.ground)
     if inputs.start is None:
         start = begin(some, seen, rig, camera, config)
@@ -95,7 +78,7 @@ def fit_bodies(
         lasting=lasting_of(rig.names) if config.lasting else None,
     )  # fmt: skip
     people, person = some.person.unique(return_inverse=True)
-    frame = Frame(rig, start.root, person, growth_of(model), inputs.prior)
+    frame = unknowns.Frame(rig, start.root, person, growth_of(model), inputs.prior)
     code = encoded(inputs.prior, start.at.code)
     at = dataclasses.replace(
         start.at, code=code, **_widened(len(code), len(people), rig, model, config)
@@ -108,14 +91,14 @@ def fit_bodies(
 
 
 def _widened(
-    rows: int, people: int, rig: Rig, model: SkinnedBody, config: FitConfig
+    rows: int, people: int, rig: unknowns.Rig, model: SkinnedBody, config: FitConfig
 ) -> dict[str, Tensor]:
     """Shapes of all people, and hands and faces where they are seen and the model has them."""
     skin = rig.model
     hands, face = 0, 0
     if len(skin.parents) > 24 and any("index" in name for name in rig.names):
         space = model.hands
-        hands = HAND if space is None else min(HANDS, space.components.shape[1])
+        hands = unknowns.HAND if space is None else min(HANDS, space.components.shape[1])
     if len(skin.parents) == 55 and any(n.startswith("face_") for n in rig.names):
         assert model.expression_dirs is not None
         face = 3 + min(EXPRESSION, model.expression_dirs.shape[-1])
@@ -143,19 +126,19 @@ def _on_a_floor(state: FitState, model: SkinnedBody) -> FitState:
 def _solved(state: FitState, keypoints: Keypoints, observe: Observer) -> FitState:
     """All rows; the shapes first from some of them where there are too many at once."""
     windows = tracks.windows_of(keypoints, state.config)
-    first, bias = _stages(state, keypoints, windows[0].rows, EVERYTHING, observe)
+    first, bias = _stages(state, keypoints, windows[0].rows, unknowns.EVERYTHING, observe)
     parts = [first]
     if len(windows) > 1:
         shared = {name: getattr(first, name) for name in ("betas", "offset", "floor")}
         whole = state.at_values(**shared)
         windows = windows[1:]
-        parts = [_stages(whole, keypoints, w.rows, OF_ROWS, observe)[0] for w in windows]
+        parts = [_stages(whole, keypoints, w.rows, unknowns.OF_ROWS, observe)[0] for w in windows]
     back = torch.argsort(torch.cat([w.rows[w.keep] for w in windows]))
     fields = {
         name: torch.cat([
             getattr(part, name)[w.keep] for part, w in zip(parts, windows, strict=True)
         ])[back]
-        for name in OF_ROWS
+        for name in unknowns.OF_ROWS
     }  # fmt: skip
     at = dataclasses.replace(parts[0], **fields)
     at = at if bias is None else without(at, bias, state.frame.person)
@@ -168,15 +151,23 @@ def _stages(
     rows: Int[Tensor, " rows"],
     free: tuple[str, ...],
     observe: Observer,
-) -> tuple[Unknowns, Bias | None]:
+) -> tuple[unknowns.Unknowns, Bias | None]:
     """All stages over some of the rows, and what noise did to all of them; None: not known."""
     config, names = state.config, state.frame.rig.names
     stages, some = tracks.stages_of(config, names), rows_of(keypoints, rows)
     at, frame = rows_of(state.at, rows, "bodies"), rows_of(state.frame, rows, "bodies")
     state, noise = FitState(at, frame, rows_of(state.seen, rows, "bodies"), config), None
-    state = state.given(motion=tracks.motion_of(some, _speed(state, some), config))
+    speed = None  # of joints across the view [m/s]
+    if some.fps is not None:
+        there = tracks.confidence_of(some, config) > 0
+        pixels = tracks.joint_speed(some, there).to(at.place)
+        speed = pixels * unknowns.log_depth(at, frame).exp()[:, None] / state.seen.K[0, 0]
+    state = state.given(motion=tracks.motion_of(some, speed, config))
     for index, stage in enumerate(stages):
-        state = _standing(state)
+        if state.at.floor.numel():  # the share of the bodies that their legs carry
+            with torch.no_grad():
+                standing = ground.standing_share(state.points.joints, state.plane[0])
+            state = state.given(standing=standing)
         if index == 1 and config.left:
             state = _lowered(state, dataclasses.replace(stage, steps=config.noise_steps), free)
             off = _pixels(state) - state.seen.pixels
@@ -184,9 +175,9 @@ def _stages(
             state = state.given(weight=at_most(state.seen, noise, stage.pose))
         state = _laid(_lowered(state, stage, free), some)
         if state.seen.about is not None:  # not jointly: the lying bodies moved the upright ones
-            state = _lowered(state, stage, OF_ROWS)
+            state = _lowered(state, stage, unknowns.OF_ROWS)
         observe(Step("fit_bodies", index, len(stages)))
-    shared = len(free) == len(EVERYTHING)
+    shared = len(free) == len(unknowns.EVERYTHING)
     return state.at, _bias(state, noise, stages[-1]) if shared and noise is not None else None
 
 
@@ -197,10 +188,10 @@ def _lowered(state: FitState, stage: Stage, free: tuple[str, ...]) -> FitState:
     weight = weight * weight.new_tensor([factor[kind_of(n)] for n in state.frame.rig.names])
     staged = state.given(weight=weight)
 
-    def energy(at: Unknowns) -> Energy:
+    def energy(at: unknowns.Unknowns) -> Energy:
         return dataclasses.replace(staged, at=at).energy(stage)
 
-    return dataclasses.replace(state, at=solve(energy, state.at, stage.steps, free))
+    return dataclasses.replace(state, at=unknowns.solve(energy, state.at, stage.steps, free))
 
 
 def _pixels(state: FitState) -> Float[Tensor, "bodies keypoints 2"]:
@@ -214,19 +205,10 @@ def _bias(state: FitState, noise: Float[Tensor, " bodies"], stage: Stage) -> Bia
     config, person = state.config, state.frame.person
     pixels = noisy(_pixels(state), noise)
     quick = dataclasses.replace(stage, steps=config.noise_steps)
-    again = _lowered(state.given(pixels=pixels), quick, EVERYTHING)
+    again = _lowered(state.given(pixels=pixels), quick, unknowns.EVERYTHING)
     left = noise_of(_pixels(again) - pixels, state.seen, person, config.left)
     share = (noise / left.clamp_min(1e-6)).square().clamp_max(1)
     return bias_of(state.at, again.at, person, share)
-
-
-def _standing(state: FitState) -> FitState:
-    """With the share of the bodies that their legs carry, as they are now."""
-    if not state.at.floor.numel():
-        return state
-    with torch.no_grad():
-        standing = ground.standing_share(state.points.joints, state.plane[0])
-    return state.given(standing=standing)
 
 
 def _laid(state: FitState, keypoints: Keypoints) -> FitState:
@@ -242,22 +224,13 @@ def _laid(state: FitState, keypoints: Keypoints) -> FitState:
     free = about.isnan()
     if bool(free.all()):
         return state
-    about = about - grown(at, state.frame)[state.frame.person]
+    about = about - unknowns.grown(at, state.frame)[state.frame.person]
     depth = torch.where(free, at.place[:, 2], about)
     place = torch.cat([at.place[:, :2], depth[:, None]], -1)
     return state.at_values(place=place).given(about=about)
 
 
-def _speed(state: FitState, keypoints: Keypoints) -> Float[Tensor, "rows joints"] | None:
-    """How fast joints seem to move across the view [m/s]; None without a frame rate."""
-    if keypoints.fps is None:
-        return None
-    there = tracks.confidence_of(keypoints, state.config) > 0
-    pixels = tracks.joint_speed(keypoints, there).to(state.at.place)
-    return pixels * log_depth(state.at, state.frame).exp()[:, None] / state.seen.K[0, 0]
-
-
-def pose_of(at: Unknowns, frame: Frame, model: SkinnedBody) -> BodyPose:
+def pose_of(at: unknowns.Unknowns, frame: unknowns.Frame, model: SkinnedBody) -> BodyPose:
     """Parameters of the fitted bodies."""
     angles = frame.prior.decode(at.code)
     width = widths_of(model)["body_pose"]
@@ -273,13 +246,13 @@ def pose_of(at: Unknowns, frame: Frame, model: SkinnedBody) -> BodyPose:
         rest = rest + at.face[:, 3:] @ dirs.mT
     if at.hands.shape[1]:
         extra["left_hand_pose"], extra["right_hand_pose"] = (
-            hand_angles(frame.rig, at.hands, side) for side in (0, 1)
+            unknowns.hand_angles(frame.rig, at.hands, side) for side in (0, 1)
         )
         extra[FLAT] = body.new_ones(len(body), 1)
     return BodyPose(
         model=model.name, gender=model.gender, betas=betas,
-        global_orient=rotation_vectors(turns_of(at, frame)[:, 0]), body_pose=body,
-        transl=pelvis_of(at, frame) - rest, extra=extra,
+        global_orient=rotation_vectors(unknowns.turns_of(at, frame)[:, 0]), body_pose=body,
+        transl=unknowns.pelvis_of(at, frame) - rest, extra=extra,
     )  # fmt: skip
 
 

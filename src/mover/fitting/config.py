@@ -29,13 +29,10 @@ class Stage:
 
 
 PUBLISHED = (
-    Stage(404, 100, 404, 4.04e3, 0, 0),
-    Stage(404, 50, 404, 4.04e3, 0, 0),
-    Stage(57.4, 10, 57.4, 574, 0, 0),
     Stage(4.78, 5, 4.78, 47.8, 0.1, 0),
     Stage(4.78, 5, 4.78, 47.8, 2, 2),
 )
-"""The stages of SMPLify-X's configuration for SMPL-X."""
+"""The last two of the five stages of SMPLify-X's configuration for SMPL-X."""
 STAGES = (
     Stage(20.0, 5.0, 57.4, 574, 0.0, 0.0, steps=120),
     Stage(4.78, 5.0, 4.78, 47.8, 0.1, 0.0, steps=280),
@@ -92,7 +89,7 @@ Preset = Literal["robust", "paper"]
 PAPER = FitConfig(
     loose=0.0, left=0.0, limits=0.0, smooth_joints=1e2, smooth_pixels=1e-2, still=0.0, held=0.0,
     stands=0.0, lies=0.0, acceleration=0.0, jitter=1.0, by_size=False, independent_frames=1_000_000,
-    lasting=False, stages=tuple(replace(stage, smooth=1.0, steps=300) for stage in PUBLISHED[3:]),
+    lasting=False, stages=tuple(replace(stage, smooth=1.0, steps=300) for stage in PUBLISHED),
 )  # fmt: skip
 """SMPLify-X and L_smooth (Sec. 3.2), in the two stages that the authors' fit of videos runs.
 

@@ -16,17 +16,8 @@ from mover.core.observe import Energy
 from mover.core.records import record
 from mover.energy.body_terms import Neighbours, body_energy
 from mover.energy.config import BodyWeights
-from mover.fitting import ground
+from mover.fitting import ground, priors
 from mover.fitting.config import FitConfig, Stage
-from mover.fitting.priors import (
-    Stature,
-    bent_wrong,
-    excess_of,
-    height_cost,
-    off_pose,
-    shape_cost,
-    size_of,
-)
 from mover.fitting.unknowns import Frame, Points, Unknowns, floor_of, points_of
 from mover.geometry.camera import project
 
@@ -71,7 +62,7 @@ class Seen:
     """How far from it each angle may be [rad]."""
     motion: TrackMotion | None = None
     """None: rows are not neighbours in time."""
-    stature: Stature | None = None
+    stature: priors.Stature | None = None
     """The prior of their heights; None: the mean shape's, as one more coefficient."""
     lasting: Float[Tensor, " keypoints"] | None = None
     """How far a detector puts each keypoint lastingly from the model's [m]; None: nowhere."""
@@ -182,7 +173,7 @@ class FitState:
         """Joints of the body, in sizes of it, so that smoothness pulls no person nearer."""
         joints = self.points.joints
         if self.config.by_size:
-            joints = joints / size_of(joints)[:, None, None]
+            joints = joints / priors.size_of(joints)[:, None, None]
         return joints[:, : len(BODY)]
 
     @cached_property
@@ -229,17 +220,17 @@ class FitState:
         """The pose off the one that is expected and what is usual, or a learned prior's code."""
         if self.frame.prior.width:
             return self.at.code, 1.0
-        return off_pose(self.angles, self.seen.centre), self.seen.spread
+        return priors.off_pose(self.angles, self.seen.centre), self.seen.spread
 
     @property
     def excess(self) -> Float[Tensor, "bodies 63"]:
         """Angles beyond the ranges of motion."""
-        return excess_of(self.angles)
+        return priors.excess_of(self.angles)
 
     @property
     def bent(self) -> Float[Tensor, "bodies 4"]:
         """Elbows and knees, the wrong way [rad]."""
-        return bent_wrong(self.angles)
+        return priors.bent_wrong(self.angles)
 
     @cached_property
     def count(self) -> Float[Tensor, " bodies"]:
@@ -257,11 +248,11 @@ class FitState:
         """Squared standard deviations of the shape, one share for each row."""
         stature, cost = self.seen.stature, self.at.betas.square().sum(-1)
         if stature is not None and self.seen.lasting is not None:
-            cost = shape_cost(stature, self.at.betas)
+            cost = priors.shape_cost(stature, self.at.betas)
         return cost[self.frame.person] / self.same
 
     @property
     def off_height(self) -> Float[Tensor, " bodies"]:
         """Squared distance from the given height, one share for each row [m²]."""
         assert self.seen.stature is not None
-        return height_cost(self.seen.stature, self.at.betas)[self.frame.person] / self.count
+        return priors.height_cost(self.seen.stature, self.at.betas)[self.frame.person] / self.count

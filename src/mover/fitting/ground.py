@@ -22,6 +22,8 @@ from torch import Tensor
 from mover.bodies.skeleton import BODY, SIDES
 from mover.bodies.skinning import SkinnedBody
 
+Joints = Float[Tensor, "bodies joints 3"]
+"""Of bodies, in camera axes [m]."""
 Plane = tuple[Float[Tensor, "3"], Float[Tensor, ""] | float]
 """Away from the floor, in camera axes, and its height along that from the camera [m]."""
 
@@ -65,14 +67,14 @@ def plane_of(floor: Float[Tensor, " floor"], up: Float[Tensor, "3"], known: floa
 
 
 def sole_heights(
-    joints: Float[Tensor, "bodies joints 3"], soles: Float[Tensor, "2"], up: Float[Tensor, "3"]
+    joints: Joints, soles: Float[Tensor, "2"], up: Float[Tensor, "3"]
 ) -> Float[Tensor, " bodies"]:
     """Height of the lower sole along `up` from the camera [m]."""
     low = torch.stack([(joints[:, both] @ up).amin(-1) for both in FEET], -1)
     return (low - soles.to(low)).amin(-1)
 
 
-def center_of_mass(joints: Float[Tensor, "bodies joints 3"]) -> Float[Tensor, "bodies 3"]:
+def center_of_mass(joints: Joints) -> Float[Tensor, "bodies 3"]:
     """Centre of mass by the segments of Winter 2009, Table 4.1 (head, arms, trunk as one) [m]."""
     names = ("hip", "knee", "ankle", "shoulder")
     hip, knee, ankle, shoulder = (joints[:, _of_sides(name)].mean(1) for name in names)
@@ -81,9 +83,7 @@ def center_of_mass(joints: Float[Tensor, "bodies joints 3"]) -> Float[Tensor, "b
     return 0.678 * upper + 0.2 * thigh + 0.122 * shank
 
 
-def standing_share(
-    joints: Float[Tensor, "bodies joints 3"], up: Float[Tensor, "3"]
-) -> Float[Tensor, " bodies"]:
+def standing_share(joints: Joints, up: Float[Tensor, "3"]) -> Float[Tensor, " bodies"]:
     """From 0 to 1, how surely the legs carry a body: long legs below an upright trunk."""
     hip, knee, ankle = (joints[:, _of_sides(name)] for name in ("hip", "knee", "ankle"))
     length = (hip - knee).norm(dim=-1) + (knee - ankle).norm(dim=-1)
@@ -94,9 +94,7 @@ def standing_share(
     return ramps[0] * ramps[1]
 
 
-def balance_cost(
-    joints: Float[Tensor, "bodies joints 3"], up: Float[Tensor, "3"]
-) -> Float[Tensor, " bodies"]:
+def balance_cost(joints: Joints, up: Float[Tensor, "3"]) -> Float[Tensor, " bodies"]:
     """Squared horizontal distance of the centre of mass from the middle of the feet [m²].
 
     A standing body is in balance (Tripathi et al. 2023, IPMAN, Sec. 3.3): keypoints hardly show
@@ -113,7 +111,7 @@ def trunk_of(joints: Float[Tensor, "*bodies joints 3"]) -> Float[Tensor, "*bodie
 
 
 def distances_of_lying_people(
-    joints: Float[Tensor, "bodies joints 3"],
+    joints: Joints,
     up: Float[Tensor, "3"],
     tracks: Sequence[Int[Tensor, " _"]],
     time: Float[Tensor, " bodies"],

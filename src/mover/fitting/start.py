@@ -211,7 +211,12 @@ def begin(
     tries = [tried(g, rows) for g in (*upright_guesses(like), *lying_guesses(like, BACK))]
     best = _followed(tries, tracks, seen.up)
     trunks = torch.stack([trunk_of(one.joints) for one in tries])
-    down = _down(trunks[best, torch.arange(len(best))], seen.up, tracks)
+    lies = trunks[best, torch.arange(len(best))] @ seen.up <= SITS
+    for track, time in tracks:
+        if time is not None:  # and the rows shortly before and after
+            near = (time[:, None] - time).abs() <= NEIGHBOURS
+            lies[track] = (near & lies[track]).any(1)
+    down = lies.nonzero()[:, 0]
     if len(down):
         for guess in lying_guesses(like, OTHERS):  # no other row may take these
             none = dataclasses.replace(tries[0], cost=torch.full_like(tries[0].cost, torch.inf))
@@ -249,18 +254,6 @@ def _tried(guess: Guess, seen: Seen, R: Float[Tensor, "3 3"], rig: Rig, config: 
         slope = (trunk_of(joints) @ seen.up).clamp(-1, 1).asin()
         cost = cost + robust_square(slope.square(), SLOPE) / LEVEL**2
     return Tried(at, frame.root, body, spread, cost, joints)
-
-
-def _down(
-    trunk: Float[Tensor, "bodies 3"], up: Float[Tensor, "3"], tracks: Sequence[Track]
-) -> Int[Tensor, " some"]:
-    """Rows of people who are not upright, and those shortly before and after."""
-    found = trunk @ up <= SITS
-    for track, time in tracks:
-        if time is not None:
-            near = (time[:, None] - time).abs() <= NEIGHBOURS
-            found[track] = (near & found[track]).any(1)
-    return found.nonzero()[:, 0]
 
 
 def _followed(

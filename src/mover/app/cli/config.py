@@ -18,7 +18,7 @@ from tyro.conf import arg
 from mover.app.cli import say
 from mover.core.errors import InputError
 from mover.core.settings import check_settings, settings_of
-from mover.pipeline.presets import PRESETS, Config, changed
+from mover.pipeline.presets import changed
 
 T = TypeVar("T")
 C = TypeVar("C")
@@ -100,16 +100,12 @@ LAYOUT_SETTINGS = {
 """The same of `LayoutConfig`, of `mover layout`."""
 
 
-def preset_named(name: str) -> Config:
-    """A preset of the main job by its name.
+def preset_named(name: str, table: Mapping[Any, T]) -> T:
+    """A preset by its name.
 
     Raises:
         InputError: If there is none of that name.
     """
-    return _named(name, PRESETS)
-
-
-def _named(name: str, table: Mapping[Any, T]) -> T:
     if name not in table:
         raise InputError(f"--preset: {name!r} is none of {', '.join(table)}")
     return table[name]
@@ -125,7 +121,7 @@ def chosen_config(arguments: Sequence[str], table: Mapping[Any, T]) -> T:
     early.add_argument("--preset", default="robust")
     early.add_argument("--config", type=Path)
     chosen, _ = early.parse_known_args(arguments)
-    config = _named(chosen.preset, table)
+    config = preset_named(chosen.preset, table)
     if chosen.config is not None:
         from mover.app.results import read_config
 

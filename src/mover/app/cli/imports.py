@@ -119,19 +119,15 @@ def _hints(args: ImportArgs, work: Path) -> "Hints":
         camera = old.camera
     if args.recording and args.recordings:
         raise InputError("--recording, --recordings: both are given, expected one of them")
-    return Hints(
-        camera, args.image, args.up, _names(args.names), args.recording, args.recordings,
-        args.boxes, work,
-    )  # fmt: skip
-
-
-def _names(given: Sequence[str]) -> dict[str, str]:
-    """`1=chair` as a table."""
-    pairs = [item.partition("=") for item in given]
-    for key, equals, value in pairs:
+    names = [item.partition("=") for item in args.names]
+    for key, equals, value in names:
         if not key or not equals or not value.strip():
             raise InputError(f"--names: has {key + equals + value!r}, expected 1=chair")
-    return {key: value.strip() for key, _, value in pairs}
+    words = {key: value.strip() for key, _, value in names}
+    return Hints(
+        camera, args.image, args.up, words, args.recording, args.recordings,
+        args.boxes, work,
+    )  # fmt: skip
 
 
 def _parts(args: ImportArgs, main: "Parts", hints: "Hints") -> "list[Parts]":

@@ -11,15 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from mover.app.batch import CONFIG, SUMMARY, BatchJob, RayOptions
+from mover.app.cli import config as flags
 from mover.app.cli import say
-from mover.app.cli.config import (
-    RUN_SETTINGS,
-    Device,
-    chosen_config,
-    parsed,
-    parsed_with,
-    preset_named,
-)
 from mover.core.settings import Seconds, int_in
 from mover.io.formats import chosen
 from mover.pipeline.presets import PRESETS, Config
@@ -48,7 +41,7 @@ class RunArgs:
     """A file of settings (a run.json) in place of a preset; it may set what has no flag, too."""
     edits: Path | None = None
     """A list of edits (edits.json of `mover view`) that is applied first."""
-    device: Device = "cpu"
+    device: flags.Device = "cpu"
     """Where the heavy stages compute: cpu, cuda (an NVIDIA GPU; see docs/engine.md) or auto."""
     refine: bool = False
     """At the end, refine the people with the room they helped to find: bodies.npz holds them."""
@@ -56,8 +49,8 @@ class RunArgs:
 
 def parse_run(arguments: Sequence[str]) -> tuple[RunArgs, Config]:
     """What `mover run` is asked for, and the settings."""
-    config = chosen_config(arguments, PRESETS)
-    return parsed_with(RunArgs, config, RUN_SETTINGS, "mover run", arguments)
+    config = flags.chosen_config(arguments, PRESETS)
+    return flags.parsed_with(RunArgs, config, flags.RUN_SETTINGS, "mover run", arguments)
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -136,8 +129,10 @@ class BatchArgs:
 
 def batch(arguments: Sequence[str]) -> None:
     """`mover batch`; the exit code is 1 if a capture failed."""
-    config = chosen_config(arguments, PRESETS)
-    args, config = parsed_with(BatchArgs, config, RUN_SETTINGS, "mover batch", arguments)
+    config = flags.chosen_config(arguments, PRESETS)
+    args, config = flags.parsed_with(
+        BatchArgs, config, flags.RUN_SETTINGS, "mover batch", arguments
+    )
     from mover.app.batch import captures_in, run_batch
 
     jobs = _jobs(args, config, captures_in(args.source, args.out))
@@ -183,14 +178,14 @@ class DemoArgs:
     """Folder for the capture and the result."""
     preset: str = "robust"
     """paper, printed or robust."""
-    device: Device = "cpu"
+    device: flags.Device = "cpu"
     """cpu, cuda or auto."""
 
 
 def demo(arguments: Sequence[str]) -> None:
     """`mover demo`."""
-    args = parsed(DemoArgs, "mover demo", arguments)
-    config = preset_named(args.preset)
+    args = flags.parsed(DemoArgs, "mover demo", arguments)
+    config = flags.preset_named(args.preset, PRESETS)
     from mover.app.demo import write_demo
     from mover.app.report.page import write_report
     from mover.app.results import Origin, report_of

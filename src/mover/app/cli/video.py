@@ -9,29 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from tyro.conf import Positional, arg
 
-from mover.app.chain import (
-    FIT,
-    OUT,
-    BodiesFrom,
-    Steps,
-    make_bodies,
-    run_command_line,
-    steps_in,
-    write_heights,
-)
+from mover.app import chain
+from mover.app.cli import config as flags
 from mover.app.cli import say
-from mover.app.cli.config import (
-    LAYOUT_SETTINGS,
-    PERCEIVE_SETTINGS,
-    Device,
-    parsed_with,
-    preset_named,
-)
 from mover.app.cli.people import FitArgs, fit_into
 from mover.core.errors import InputError
 from mover.core.settings import Index, float_in
 from mover.perceive.config import LayoutConfig, Lens, PerceiveConfig
 from mover.perceive.needs import check_needs
+from mover.pipeline.presets import PRESETS
 
 if TYPE_CHECKING:
     from mover.perceive.capture import Finders
@@ -60,8 +46,8 @@ class LayoutArgs:
 
 def layout(arguments: Sequence[str]) -> None:
     """`mover layout`."""
-    settings = LayoutConfig(), LAYOUT_SETTINGS
-    args, config = parsed_with(LayoutArgs, *settings, "mover layout", arguments)
+    settings = LayoutConfig(), flags.LAYOUT_SETTINGS
+    args, config = flags.parsed_with(LayoutArgs, *settings, "mover layout", arguments)
     layout_into(args, config)
     say(f"next: mover check {args.capture}; mover run {args.capture} --out OUT")
 
@@ -171,7 +157,7 @@ class VideoArgs:
     of the video."""
     objects_frame: Index | None = None
     """The number of that frame, from 0."""
-    bodies: str = FIT
+    bodies: str = chain.FIT
     """fit: by the open body, to the keypoints; or a FILE; or a COMMAND of a body network with
     {video}, {frames}, {camera} and {out} in it."""
     bodies_tool: str = ""
@@ -191,14 +177,14 @@ class VideoArgs:
     """Folder with your own shapes, named after their class: chair_0.obj."""
     preset: str = "robust"
     """Settings of the room: paper, printed or robust."""
-    device: Device = "cpu"
+    device: flags.Device = "cpu"
     """Where the room is computed: cpu, cuda or auto."""
 
 
 def video(arguments: Sequence[str]) -> None:
     """`mover video`."""
-    settings = PerceiveConfig(), PERCEIVE_SETTINGS
-    args, config = parsed_with(VideoArgs, *settings, "mover video", arguments)
+    settings = PerceiveConfig(), flags.PERCEIVE_SETTINGS
+    args, config = flags.parsed_with(VideoArgs, *settings, "mover video", arguments)
     video_to_room(args, config=config)
 
 
@@ -213,8 +199,8 @@ def video_to_room(
     source, config = args.source, config or PerceiveConfig()
     if not source.exists():
         raise InputError(f"{source}: there is no such file, expected a video or a folder")
-    preset_named(args.preset)
-    BodiesFrom(args.bodies, args.bodies_tool).check()
+    flags.preset_named(args.preset, PRESETS)
+    chain.BodiesFrom(args.bodies, args.bodies_tool).check()
     if finders is None:
         _check_needs(args, config)  # in the first second: nothing heavy is loaded yet
     from mover.perceive.video import pictures_of, read_picture, stamp_of
@@ -223,9 +209,13 @@ def video_to_room(
     if len(pictures) == 1:
         read_picture(pictures[0])
         say(ONE_IMAGE)
-    capture, steps = args.out / "capture", steps_in(args.out, say, STEPS)
+    capture, steps = args.out / "capture", chain.steps_in(args.out, say, STEPS)
     lens = args.camera, args.fov
-    own = [args.people_masks, args.objects, None if OUT in args.keypoints else Path(args.keypoints)]
+    own = [
+        args.people_masks,
+        args.objects,
+        None if chain.OUT in args.keypoints else Path(args.keypoints),
+    ]
     seen = [str((str(source.resolve()), *stamp_of(source))), repr(config), *map(str, lens)]
     seen += [args.keypoints, str(args.objects_frame), *("none" if p is None else p for p in own)]
     made = capture / "objects.json"
@@ -270,7 +260,7 @@ def _check_needs(args: VideoArgs, config: PerceiveConfig) -> None:
         if path is not None and not path.exists():
             raise InputError(f"{path}: there is no such file, expected masks or outlines")
     own = args.keypoints not in (NETWORK, MEDIAPIPE)
-    if own and OUT not in args.keypoints and not Path(args.keypoints).exists():
+    if own and chain.OUT not in args.keypoints and not Path(args.keypoints).exists():
         raise InputError(
             f"--keypoints: {args.keypoints!r} is neither network nor mediapipe, nor a file or "
             "folder that is there, nor a command with {out} in it"
@@ -285,11 +275,11 @@ def _own(args: VideoArgs, capture: Path) -> "Own":
     from mover.perceive.own import Own
 
     def joints() -> Path:
-        if OUT not in args.keypoints:
+        if chain.OUT not in args.keypoints:
             return Path(args.keypoints)
         out = capture / "joints-by-command"
         places = {"video": args.source, "frames": capture / "frames", "out": out}
-        run_command_line("--keypoints", args.keypoints, places)
+        chain.run_command_line("--keypoints", args.keypoints, places)
         return out
 
     given = None if args.keypoints in (NETWORK, MEDIAPIPE) else joints
@@ -299,16 +289,16 @@ def _own(args: VideoArgs, capture: Path) -> "Own":
     )  # fmt: skip
 
 
-def _bodies(capture: Path, args: VideoArgs, steps: Steps) -> None:
+def _bodies(capture: Path, args: VideoArgs, steps: chain.Steps) -> None:
     """bodies.npz, where people are seen."""
-    bodies, keypoints = BodiesFrom(args.bodies, args.bodies_tool), capture / "keypoints.npz"
+    bodies, keypoints = chain.BodiesFrom(args.bodies, args.bodies_tool), capture / "keypoints.npz"
     made = capture / "bodies.npz"
-    if args.bodies == FIT and not keypoints.is_file():
+    if args.bodies == chain.FIT and not keypoints.is_file():
         say("warning: no keypoints were found, so there are no bodies")
         steps.undo(STEPS[1], made)
         return
-    write_heights(capture, args.height)
-    given = [] if args.bodies == FIT or bodies.is_command else [Path(args.bodies)]
+    chain.write_heights(capture, args.height)
+    given = [] if args.bodies == chain.FIT or bodies.is_command else [Path(args.bodies)]
     made_from = [keypoints, lens_in(capture), args.bodies, args.bodies_tool, *given]
     made_from += map(str, args.height)
 
@@ -316,11 +306,13 @@ def _bodies(capture: Path, args: VideoArgs, steps: Steps) -> None:
         camera = capture / "camera.json"
         fit_into(FitArgs(keypoints, camera, out=made, drop=True, height=args.height))
 
-    steps.do(STEPS[1], made_from, made, lambda: make_bodies(bodies, args.source, capture, fit),
-             yours=args.bodies == FIT)  # fmt: skip
+    def work() -> None:
+        chain.make_bodies(bodies, args.source, capture, fit)
+
+    steps.do(STEPS[1], made_from, made, work, yours=args.bodies == chain.FIT)
 
 
-def _first_scene(capture: Path, args: VideoArgs, steps: Steps) -> None:
+def _first_scene(capture: Path, args: VideoArgs, steps: chain.Steps) -> None:
     """scene.json, under the camera that the bodies constrain."""
     from mover.io.files.images import find_depth_file
 
@@ -352,5 +344,6 @@ def _room(capture: Path, args: VideoArgs) -> None:
     say(f"{len(STEPS)}/{len(STEPS)} {STEPS[-1]} ...")
     people = (capture / "bodies.npz").is_file()
     origin = Origin(str(capture.resolve()), refine=people, device=device_of(args.device))
-    reconstruct_into(args.out / "room", read("folder", capture), preset_named(args.preset), origin)
+    preset = flags.preset_named(args.preset, PRESETS)
+    reconstruct_into(args.out / "room", read("folder", capture), preset, origin)
     say(f"report: {args.out / 'room' / 'report.html'}")

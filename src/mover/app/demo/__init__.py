@@ -15,9 +15,9 @@ from mover.bodies.skinning import open_body
 from mover.core.records import map_tensors
 from mover.core.types import Bodies, BodyPose
 from mover.io.capture.bodies_file import write_bodies
+from mover.io.capture.pose_file import NEEDED
 
 DATA = Path(__file__).parent / "data"
-TENSORS = ("betas", "global_orient", "body_pose", "transl")
 
 
 def write_demo(folder: Path) -> None:
@@ -33,7 +33,7 @@ def write_demo(folder: Path) -> None:
 def read_people(path: Path) -> Bodies:
     """The people of a file of parameters (float64), in the camera's axes."""
     with np.load(path) as arrays:
-        tensors = {name: torch.from_numpy(arrays[name]) for name in TENSORS}
+        tensors = {name: torch.from_numpy(arrays[name]) for name in NEEDED}
         frame, fps = torch.from_numpy(arrays["frame"]), float(arrays["fps"])
     pose = BodyPose(model="makehuman", gender="neutral", extra={}, **tensors)
     model = open_body()

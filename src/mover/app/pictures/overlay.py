@@ -38,7 +38,7 @@ def save_overlay(capture: Capture, path: Path) -> Path:
     """
     capture = map_tensors(on_cpu, capture)
     scene, bodies = capture.scene, capture.bodies
-    frames, picture = list[int](), canvas(capture.reference, scene, WIDEST)
+    frames, picture = list[int](), canvas(capture.reference, scene)
     if bodies is not None:
         count = len(bodies.frame)
         rows = torch.linspace(0, count - 1, min(count, SOME_BODIES)).long()
@@ -81,16 +81,14 @@ def on_cpu(tensor: Tensor) -> Tensor:
     return there.float() if there.is_floating_point() else there
 
 
-def canvas(
-    image: Float[Tensor, "h w 3"] | None, scene: Scene, widest: int
-) -> Float[Tensor, "height width 3"]:
-    """What the furniture is drawn on, at most `widest` pixels wide: the image or a backdrop."""
+def canvas(image: Float[Tensor, "h w 3"] | None, scene: Scene) -> Float[Tensor, "height width 3"]:
+    """What the furniture is drawn on, at most `WIDEST` pixels wide: the image or a backdrop."""
     if image is None:
-        width = min(widest, scene.camera.width)
+        width = min(WIDEST, scene.camera.width)
         return backdrop(max(1, round(width * scene.camera.height / scene.camera.width)), width)
-    if image.shape[1] <= widest:
+    if image.shape[1] <= WIDEST:
         return image.detach().cpu().float()
-    size = (widest, max(1, round(widest * image.shape[0] / image.shape[1])))
+    size = (WIDEST, max(1, round(WIDEST * image.shape[0] / image.shape[1])))
     return sized(Image.fromarray(pixels(image)), size)
 
 

@@ -9,15 +9,8 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
+from mover.app.pictures import film
 from mover.app.pictures.config import FILM, STILL, RenderConfig, check_ending
-from mover.app.pictures.film import (
-    pixels,
-    save_film,
-    save_still,
-    sized,
-    video_library,
-    video_pictures,
-)
 from mover.app.pictures.overlay import backdrop
 from mover.app.pictures.paint import draw_picture, furniture, joined, people
 from mover.core.errors import InputError
@@ -50,14 +43,14 @@ def render_result(out: Path, path: Path, config: RenderConfig, capture: Path | N
     if path.suffix.lower() in STILL:
         middle = frames[len(frames) // 2] if frames else 0
         frame = middle if config.frame is None else config.frame
-        save_still(next(render_room(scene, shown, [frame], config.width, capture)), path)
+        film.save_still(next(render_room(scene, shown, [frame], config.width, capture)), path)
         return 1
-    video_library(f"--to {path.name}")
+    film.video_library(f"--to {path.name}")
     if bodies is None or not frames:
         raise InputError("--to: nothing moves: ask for a .png")
     steps = torch.tensor(frames).diff().float()
     rate = (bodies.fps or FPS) / (max(1.0, float(steps.median())) if len(steps) else 1.0)
-    return save_film(render_room(scene, shown, frames, config.width, capture), rate, path)
+    return film.save_film(render_room(scene, shown, frames, config.width, capture), rate, path)
 
 
 def render_room(
@@ -73,8 +66,8 @@ def render_room(
     base = backdrop(size[1], size[0])
     found: Iterator[Float[Tensor, "h w 3"] | None] = iter([None] * len(frames))
     if capture is not None:
-        image, found = read("folder", capture).reference, video_pictures(capture, frames, size)
-        base = base if image is None else sized(Image.fromarray(pixels(image)), size)
+        image, found = read("folder", capture).reference, film.video_pictures(capture, frames, size)
+        base = base if image is None else film.sized(Image.fromarray(film.pixels(image)), size)
     for frame, picture in zip(frames, found, strict=True):
         stands = tuple(placed_at(item, frame) for item in scene.objects)
         surfaces = [furniture(dataclasses.replace(scene, objects=stands))]

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mover import __version__
 from mover.app.pictures.film import pixels
-from mover.app.pictures.overlay import WIDEST, canvas, draw_overlay, on_cpu
+from mover.app.pictures.overlay import canvas, draw_overlay, on_cpu
 from mover.app.report import asset, fill
 from mover.app.report.plan import draw_top, extent_of
 from mover.app.report.scene_view import ReportScene, pack_view
@@ -80,7 +80,10 @@ def write_report(out: Path, content: ReportContent) -> Path:
 
 def _page(content: ReportContent) -> str:
     """The whole text."""
-    scenes = (content.initial, content.result)
+    scenes, worlds = (content.initial, content.result), (content.initial_bodies, content.bodies)
+    extent = extent_of(*scenes, *worlds, content.truth)
+    scores = [(content.metrics or {}).get(key) or {} for key in ("initial", "result")]
+    metrics = [(key, metric_of(key)) for key in TILES if key in scores[1]]
     view, (before, after) = beside(
         lambda: _view(content), lambda: mapped(lambda s: _overlay(content, s), scenes)
     )
@@ -90,10 +93,16 @@ def _page(content: ReportContent) -> str:
         style=asset("report.css"),
         script=asset("page.js") + asset("viewer.js"),
         lead=lead(content),
-        tiles=_tiles(content),
+        tiles=[
+            (m.label, shown(m.unit, scores[0].get(key)), shown(m.unit, scores[1][key], named=True))
+            for key, m in metrics
+        ],
         before=before,
         after=after,
-        plans=_plans(content),
+        plans=[
+            (name, draw_top(scene, content.truth, people, extent=extent))
+            for name, scene, people in zip(("Before", "After"), scenes, worlds, strict=True)
+        ],
         tables=(
             ("How far from the truth", metrics_table(content.metrics or {})),
             (
@@ -134,27 +143,6 @@ def _count(number: int, one: str, many: str) -> str:
     return f"{number:,} {one if number == 1 else many}"
 
 
-def _tiles(content: ReportContent) -> list[tuple[str, str, str]]:
-    """The few numbers that matter most, before and after."""
-    before, after = ((content.metrics or {}).get(k) or {} for k in ("initial", "result"))
-    metrics = [(key, metric_of(key)) for key in TILES if key in after]
-    return [
-        (m.label, shown(m.unit, before.get(key)), shown(m.unit, after[key], named=True))
-        for key, m in metrics
-    ]
-
-
-def _plans(content: ReportContent) -> list[tuple[str, str]]:
-    """The room from above, before and after."""
-    sides = (
-        ("Before", content.initial, content.initial_bodies),
-        ("After", content.result, content.bodies),
-    )
-    things = [thing for _, *both in sides for thing in both]
-    extent = extent_of(*things, content.truth)
-    return [(n, draw_top(scene, content.truth, b, extent=extent)) for n, scene, b in sides]
-
-
 def _view(content: ReportContent) -> ReportScene:
     """The 3D view's data."""
     scenes = {"initial": content.initial, "result": content.result, "truth": content.truth}
@@ -167,6 +155,6 @@ def _view(content: ReportContent) -> ReportScene:
 
 def _overlay(content: ReportContent, scene: Scene) -> str:
     """The image with the furniture drawn over it, as a JPEG that stands in the page itself."""
-    image, file = draw_overlay(canvas(content.image, scene, WIDEST), scene), io.BytesIO()
+    image, file = draw_overlay(canvas(content.image, scene), scene), io.BytesIO()
     Image.fromarray(pixels(image)).save(file, "JPEG", quality=QUALITY, subsampling=0)
     return "data:image/jpeg;base64," + base64.b64encode(file.getvalue()).decode()

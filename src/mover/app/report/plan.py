@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mover.app.report import fill
 from mover.core.colours import colour, css, person_colour
-from mover.core.types import Bodies, Camera, Scene, SceneObject
+from mover.core.types import Bodies, Scene, SceneObject, rows_by_person
 from mover.geometry.boxes import box_of
 from mover.geometry.placement import place_object
 
@@ -57,28 +57,24 @@ def draw_top(
     Filled footprints with arrows at their fronts; dashed ones of the truth in its own world; dots
     at pelvises and soles of people in the world of `scene`. Without `extent` everything is shown.
     """
-    extent = extent or extent_of(scene, truth, bodies)
+    extent, camera = extent or extent_of(scene, truth, bodies), scene.camera
+    # The borders of the middle row of the image.
+    middle = torch.tensor([[0.0, camera.height / 2, 1.0], [camera.width, camera.height / 2, 1.0]])
+    rays = middle.to(camera.K) @ torch.linalg.inv(camera.K).mT @ camera.R_cam_world
+    reach = RANGE * abs(extent.far) / rays[:, 2:].abs().clamp_min(1e-3)
     wide = max(extent.right - extent.left, extent.near - extent.far)  # a page may show more
     return fill(
         "plan.svg",
         extent=extent,
         columns=range(math.floor(extent.left - wide), math.ceil(extent.right + wide) + 1),
         rows=range(math.floor(extent.far - wide), math.ceil(extent.near + wide) + 1),
-        sight=_sight(scene.camera, extent),
+        sight=(reach * rays[:, [0, 2]]).tolist(),
         objects=[
             _footprint(item) | {"tint": css(colour(k))} for k, item in enumerate(scene.objects)
         ],
         truth=[_footprint(item) for item in (() if truth is None else truth.objects)],
         people=[] if bodies is None else _people(bodies),
     )
-
-
-def _sight(camera: Camera, extent: Extent) -> list[list[float]]:
-    """Where the borders of the middle row of the image end on the plan [m]."""
-    middle = torch.tensor([[0.0, camera.height / 2, 1.0], [camera.width, camera.height / 2, 1.0]])
-    rays = middle.to(camera.K) @ torch.linalg.inv(camera.K).mT @ camera.R_cam_world
-    reach = RANGE * abs(extent.far) / rays[:, 2:].abs().clamp_min(1e-3)
-    return (reach * rays[:, [0, 2]]).tolist()
 
 
 def _footprint(item: SceneObject) -> dict[str, Any]:
@@ -92,13 +88,11 @@ def _footprint(item: SceneObject) -> dict[str, Any]:
 def _people(bodies: Bodies) -> list[dict[str, Any]]:
     """Where the people's pelvises go (a line with dots) and where their soles are (small dots)."""
     people: list[dict[str, Any]] = []
-    for person in bodies.person.unique().tolist():
-        rows = (bodies.person == person).nonzero()[:, 0]
-        rows = rows[bodies.frame[rows].argsort()]
+    for rows in rows_by_person(bodies.frame, bodies.person):
         rows = rows[:: max(1, math.ceil(len(rows) / DOTS))]
         people.append({
             "kind": "person few" if len(rows) < FEW else "person",
-            "tint": css(person_colour(person)),
+            "tint": css(person_colour(int(bodies.person[rows[0]]))),
             "hips": _hips(bodies, rows).tolist(),
             "soles": _soles(bodies, rows).tolist(),
             "walks": bodies.fps is not None,

@@ -3,7 +3,7 @@
 import math
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -59,18 +59,13 @@ def _add_time_line(window: RoomWindow) -> None:
         running.set()
         play.label = "Pause"
         while running.is_set() and window.people.bodies is not None:
-            pace, every = _pace(window.people.bodies.fps or DEFAULT_PACE, window.people.frames)
-            slider.value = (int(slider.value) + every) % len(window.people.frames)
-            time.sleep(1 / pace)
+            shown = window.people.frames
+            gap = float(np.median(np.diff(shown))) if len(shown) > 1 else 1.0
+            moments = (window.people.bodies.fps or DEFAULT_PACE) / max(gap, 1.0)  # a second
+            every = max(1, round(moments / FASTEST))
+            slider.value = (int(slider.value) + every) % len(shown)
+            time.sleep(every / moments)
         play.label = "Play"
-
-
-def _pace(fps: float, frames: Sequence[int]) -> tuple[float, int]:
-    """Pictures a second, and the moments from one to the next."""
-    gap = float(np.median(np.diff(frames))) if len(frames) > 1 else 1.0
-    moments = fps / max(gap, 1.0)
-    every = max(1, round(moments / FASTEST))
-    return moments / every, every
 
 
 def _add_looks(window: RoomWindow) -> None:
@@ -195,11 +190,8 @@ def _add_edits(window: RoomWindow) -> None:
     # The fields are rounded: numbers that still say what they said change nothing.
     def put(item: SceneObject) -> None:
         now, turn = item.t_world_object, torch.tensor(math.radians(yaw.value))
-        t, asked, box = (
-            torch.tensor(position.value),
-            torch.tensor(size.value) / 100,
-            box_of(item).size,
-        )
+        t, asked = torch.tensor(position.value), torch.tensor(size.value) / 100
+        box = box_of(item).size
         scale = item.scale * asked / box.clamp_min(1e-6)
         session.put(
             replace(

@@ -10,19 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mover.core.types import Bodies, Scene, SceneObject
+from mover.io.capture import edits as editing
 from mover.io.capture.bodies_file import read_bodies
-from mover.io.capture.edits import (
-    Delete,
-    Edit,
-    Pin,
-    Place,
-    edit_scene,
-    joined,
-    pinned_ids,
-    placement_of,
-    read_edits,
-    write_edits,
-)
 from mover.io.capture.scene_file import read_scene
 from mover.io.files.fields import At, read_json
 from mover.io.files.images import read_image_file
@@ -71,7 +60,7 @@ class Session:
 
     shown: Shown
     file: Path | None  #: where the edits are kept; None: nowhere
-    edits: tuple[Edit, ...] = ()
+    edits: tuple[editing.Edit, ...] = ()
     done: int = 0  #: number of edits that are part of `shown.result`
     selected: str | None = None
     listeners: list[Callable[[], None]] = field(default_factory=list[Callable[[], None]])
@@ -79,12 +68,12 @@ class Session:
     @property
     def scene(self) -> Scene:
         """The room with the edits that no run has used yet."""
-        return edit_scene(self.shown.result, self.edits[self.done :])
+        return editing.edit_scene(self.shown.result, self.edits[self.done :])
 
     @property
     def pinned(self) -> tuple[str, ...]:
         """The objects that the next run will not move."""
-        return pinned_ids(self.scene, self.edits)
+        return editing.pinned_ids(self.scene, self.edits)
 
     def object_named(self, name: str | None) -> SceneObject | None:
         """An object of the room by its id."""
@@ -103,7 +92,7 @@ class Session:
             torch.allclose(getattr(old, key), getattr(moved, key), atol=1e-5)
             for key in ("t_world_object", "yaw", "scale")
         ):
-            self.record(Place(moved.id, placement_of(moved, self.shown.result)))
+            self.record(editing.Place(moved.id, editing.placement_of(moved, self.shown.result)))
 
     def pin(self, name: str, pinned: bool) -> None:
         """Fix an object at its present position, or let runs move it again."""
@@ -111,13 +100,13 @@ class Session:
         if item is None or pinned == (name in self.pinned):
             return
         if pinned:
-            self.record(Place(name, placement_of(item, self.shown.result)))
-        self.record(Pin(name, pinned))
+            self.record(editing.Place(name, editing.placement_of(item, self.shown.result)))
+        self.record(editing.Pin(name, pinned))
 
     def delete(self, name: str) -> None:
         """Take an object away."""
         if self.object_named(name) is not None:
-            self.record(Delete(name))
+            self.record(editing.Delete(name))
 
     def undo(self) -> None:
         """Take the last edit back; one that a run has used acts until the next run."""
@@ -126,9 +115,9 @@ class Session:
             self.done = min(self.done, len(self.edits))
             self._save()
 
-    def record(self, edit: Edit) -> None:
+    def record(self, edit: editing.Edit) -> None:
         """Append an edit; several placements of one object in a row become one."""
-        self.edits = (*self.edits[: self.done], *joined(self.edits[self.done :], edit))
+        self.edits = (*self.edits[: self.done], *editing.joined(self.edits[self.done :], edit))
         self._save()
 
     def listen(self, listener: Callable[[], None]) -> None:
@@ -143,7 +132,7 @@ class Session:
 
     def _save(self) -> None:
         if self.file is not None:
-            write_edits(self.edits, self.file)
+            editing.write_edits(self.edits, self.file)
         if self.object_named(self.selected) is None:
             self.selected = None
         self.changed()
@@ -155,7 +144,7 @@ def start_session(shown: Shown, file: Path | None) -> Session:
     Raises:
         InputError: If the edits do not fit the result.
     """
-    edits = read_edits(file) if file is not None and file.is_file() else ()
+    edits = editing.read_edits(file) if file is not None and file.is_file() else ()
     session = Session(shown, file, edits, min(int(shown.log.get("edits", 0)), len(edits)))
     assert session.scene is not None  # edits that do not fit are refused here
     return session

@@ -14,7 +14,7 @@ from torch import Tensor
 from mover.bodies.corrected import has_mean_shape
 from mover.core.errors import InputError
 from mover.core.types import Bodies
-from mover.io.capture.pose_file import pose_of, pose_to_arrays, posed, reproduces
+from mover.io.capture.pose_file import NEEDED, pose_of, posed, reproduces
 from mover.io.files.fields import FASTEST, SLOWEST, At, Warn
 from mover.io.files.looks import check_faces
 from mover.io.files.npz import AMASS, is_amass, read_npy, read_npz, write_npz
@@ -159,8 +159,10 @@ def bodies_to_arrays(bodies: Bodies) -> dict[str, NDArray[Any]]:
     if bodies.joints is not None:
         arrays["joints"] = bodies.joints.detach().cpu().numpy()
         arrays["joint_names"] = np.array(bodies.joint_names, dtype=np.str_)
-    if bodies.pose is not None:
-        arrays |= pose_to_arrays(bodies.pose)
+    if (pose := bodies.pose) is not None:
+        tensors = {key: getattr(pose, key) for key in NEEDED} | pose.extra
+        arrays |= {"model": np.array(pose.model), "gender": np.array(pose.gender)}
+        arrays |= {key: value.detach().cpu().numpy() for key, value in tensors.items()}
     return arrays
 
 

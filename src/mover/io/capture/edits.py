@@ -79,7 +79,7 @@ def apply_edits(capture: Capture, edits: Sequence[Edit]) -> tuple[Capture, tuple
 
 
 def edit_scene(scene: Scene, edits: Sequence[Edit]) -> Scene:
-    """The scene after the edits, in its own world.
+    """The scene after the edits, which are carried from their worlds to its own.
 
     Raises:
         InputError: If an edit names an object that is not there.
@@ -91,11 +91,19 @@ def edit_scene(scene: Scene, edits: Sequence[Edit]) -> Scene:
             found = f"edits[{index}] has {edit.id!r}"
             raise InputError(f"{found}, expected an object of the scene: {known}")
         if isinstance(edit, Place):
-            objects[edit.id] = _placed(objects[edit.id], edit.at, scene)
+            at, new = edit.at, scene.camera.R_cam_world
+            t, yaw, scale = (torch.tensor(x).float() for x in (at.translation, at.yaw, at.scale))
+            put = replace(objects[edit.id], t_world_object=t, yaw=yaw, scale=scale, segments=())
+            old = tilted(torch.tensor(at.pitch), torch.tensor(at.roll))
+            # The front is the level direction that `recast` turns back into the edit's: a pinned
+            # object returns exactly when a run finds that camera.
+            front, up_old, up_new = old @ facing(yaw), old[:, 1], new[:, 1]
+            front = front - up_old * (front @ up_new) / (up_old @ up_new)
+            objects[edit.id] = carried(put, front, old, new)
         elif isinstance(edit, Delete):
             below = objects.pop(edit.id).support
-            carried = [key for key, one in objects.items() if one.support == edit.id]
-            objects |= {key: replace(objects[key], support=below) for key in carried}
+            above = [key for key, one in objects.items() if one.support == edit.id]
+            objects |= {key: replace(objects[key], support=below) for key in above}
     return replace(scene, objects=tuple(objects.values()))
 
 
@@ -118,19 +126,6 @@ def joined(edits: Sequence[Edit], new: Edit) -> tuple[Edit, ...]:
     if isinstance(last, Place) and isinstance(new, Place) and last.id == new.id:
         return (*edits[:-1], new)
     return (*edits, new)
-
-
-def _placed(one: SceneObject, at: Placement, scene: Scene) -> SceneObject:
-    """The object where an edit puts it, carried from the edit's world to that of the scene.
-
-    Its front is the level direction that `recast` turns back into the edit's: a pinned object
-    returns exactly when a run finds that camera.
-    """
-    t, yaw, scale = (torch.tensor(x).float() for x in (at.translation, at.yaw, at.scale))
-    put = replace(one, t_world_object=t, yaw=yaw, scale=scale, segments=())
-    old, new = tilted(torch.tensor(at.pitch), torch.tensor(at.roll)), scene.camera.R_cam_world
-    front, up_old, up_new = old @ facing(yaw), old[:, 1], new[:, 1]
-    return carried(put, front - up_old * (front @ up_new) / (up_old @ up_new), old, new)
 
 
 def facing(yaw: Float[Tensor, ""]) -> Float[Tensor, "3"]:

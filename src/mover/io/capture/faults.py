@@ -20,19 +20,8 @@ from mover.furniture.library import canonical
 from mover.geometry.boxes import iou2d
 from mover.geometry.placement import place_object
 from mover.geometry.rle import mask_boxes
+from mover.io.capture import agreement as agree
 from mover.io.capture import mends
-from mover.io.capture.agreement import (
-    FULL_TURN,
-    SCORES,
-    Agreement,
-    agreement,
-    assigned,
-    in_image,
-    outlines,
-    pairwise_iou2d,
-    partners,
-    thinned_capture,
-)
 from mover.io.capture.folder import write_capture
 from mover.io.files.fields import listed
 
@@ -70,7 +59,7 @@ class Fault:
 class Findings:
     """How well a capture lies on its picture."""
 
-    agreement: Agreement
+    agreement: agree.Agreement
     """As it is given."""
     faults: tuple[Fault, ...]
     unexplained: tuple[str, ...]
@@ -92,8 +81,8 @@ class Findings:
 
 def check_against_picture(capture: Capture) -> Findings:
     """Hold scene, bodies and masks of a capture against each other: all lie in one picture."""
-    thin = thinned_capture(capture)
-    own = found = agreement(thin)
+    thin = agree.thinned_capture(capture)
+    own = found = agree.agreement(thin)
     faults: list[Fault] = []
     while len(faults) < MOST_FAULTS:
         best, least = None, 0.0
@@ -101,7 +90,7 @@ def check_against_picture(capture: Capture) -> Findings:
             other = fault.mend(thin)
             if other is thin:
                 continue
-            better = agreement(other, (thin, found))
+            better = agree.agreement(other, (thin, found))
             gain = _gain(found, better) - fault.margin
             if gain > least:
                 best, least = (fault, other, better), gain
@@ -133,14 +122,14 @@ def mean(score: Float[Tensor, " n"]) -> float:
     return float(known.mean()) if len(known) else 0.0
 
 
-def _gain(own: Agreement, other: Agreement) -> float:
+def _gain(own: agree.Agreement, other: agree.Agreement) -> float:
     """By how much the scores of another capture are better; none where masks lose their bodies."""
     before, after = (int((~one.people.isnan()).sum()) for one in (own, other))
-    pairs = [(getattr(own, name), getattr(other, name)) for name in SCORES]
+    pairs = [(getattr(own, name), getattr(other, name)) for name in agree.SCORES]
     return -1.0 if after < before / 2 else sum(mean(b) - mean(a) for a, b in pairs)
 
 
-def _unexplained(thin: Capture, found: Agreement) -> Iterator[str]:
+def _unexplained(thin: Capture, found: agree.Agreement) -> Iterator[str]:
     """What fits nothing, and that nothing could be compared."""
     rows, both = int((~found.people.isnan()).sum()), "(mean overlap in the picture {:.2f})"
     if not len(found.objects) and not rows:
@@ -172,7 +161,7 @@ PEOPLE = {"mirrored": "-x y z", "flipped": "x -y z", "upside down": "-x -y z"}
 UP = "R_cam_world maps the world (+y up) to the camera (x right, y down, z forward)"
 
 
-def hypotheses(capture: Capture, found: Agreement) -> Iterator[Fault]:
+def hypotheses(capture: Capture, found: agree.Agreement) -> Iterator[Fault]:
     """All faults that a (thinned) capture may have; of equals, the first is meant."""
     yield from _worlds()
     for unit, k in UNITS.items():
@@ -185,7 +174,7 @@ def hypotheses(capture: Capture, found: Agreement) -> Iterator[Fault]:
         ):
             yield Fault(f"{what} are in {unit}", cure, by)
     yaws = torch.stack([*(one.yaw for one in capture.scene.objects), torch.zeros(())])
-    if float(yaws.abs().max()) > FULL_TURN or bool((yaws == yaws.round()).all()):
+    if float(yaws.abs().max()) > agree.FULL_TURN or bool((yaws == yaws.round()).all()):
         mend = partial(mends.each, mends.in_radians)
         yield Fault("scene.json: 'yaw' is in degrees", "give it in radians", mend)
     for what, mend in (
@@ -227,7 +216,7 @@ def _worlds() -> Iterator[Fault]:
 # What is fitted: times, tracks, annotations and lenses.
 
 
-def _times(capture: Capture, found: Agreement) -> Iterator[Fault]:
+def _times(capture: Capture, found: agree.Agreement) -> Iterator[Fault]:
     """The best of shifts, rates and reversal."""
     bodies, people = capture.bodies, capture.people
     if bodies is None or people is None or not len(people.frame):
@@ -250,9 +239,9 @@ def _times(capture: Capture, found: Agreement) -> Iterator[Fault]:
         for k in (1.0, rate):
             changes[name + (k != 1) * " of the same time"] = (k, round(float(first - k * start)))
     frames = torch.stack([mends.frames(bodies.frame, *change) for change in changes.values()])
-    rows = partners(frames, bodies.person.expand_as(frames), people)
+    rows = agree.partners(frames, bodies.person.expand_as(frames), people)
     masks = mask_boxes(people.masks)[rows]
-    fits = iou2d(in_image(found.boxes, capture.scene.camera).expand_as(masks), masks)
+    fits = iou2d(agree.in_image(found.boxes, capture.scene.camera).expand_as(masks), masks)
     shared = (rows >= 0).sum(1)
     fits = fits.where(rows >= 0, torch.zeros(())).sum(1) / shared.clamp_min(1)
     fits[shared < max(FEWEST, int(shared.max()) / 2)] = -1
@@ -264,7 +253,7 @@ def _times(capture: Capture, found: Agreement) -> Iterator[Fault]:
     yield Fault(f"bodies.npz: {name}", cure, partial(mends.retimed, *changes[name]), TIME_MARGIN)
 
 
-def _swaps(capture: Capture, found: Agreement) -> Iterator[Fault]:
+def _swaps(capture: Capture, found: agree.Agreement) -> Iterator[Fault]:
     """People who exchange their tracks in some frames."""
     del found
     other = mends.by_masks(capture)
@@ -283,19 +272,19 @@ def _views(capture: Capture) -> tuple[list[int], Float[Tensor, "n 4"], Float[Ten
     if not rows:
         return [], torch.zeros(0, 4), torch.zeros(0, 4)
     theirs = torch.stack([known[key] for i in rows if (key := objects[i].annotation) is not None])
-    return rows, outlines([objects[i] for i in rows], capture.scene.camera), theirs
+    return rows, agree.outlines([objects[i] for i in rows], capture.scene.camera), theirs
 
 
-def _annotations(capture: Capture, found: Agreement) -> Iterator[Fault]:
+def _annotations(capture: Capture, found: agree.Agreement) -> Iterator[Fault]:
     """Annotations that objects of one class have exchanged."""
     del found
     known, ours, theirs = _views(capture)
-    ours = in_image(ours, capture.scene.camera)
+    ours = agree.in_image(ours, capture.scene.camera)
     some = [capture.scene.objects[i] for i in known]
     kinds = [canonical(one.category) for one in some]
-    shared = pairwise_iou2d(ours, theirs)
+    shared = agree.pairwise_iou2d(ours, theirs)
     shared = shared * torch.tensor([[float(a == b) for b in kinds] for a in kinds])
-    pairs = assigned(shared, POOR) if len(some) > 1 else []
+    pairs = agree.assigned(shared, POOR) if len(some) > 1 else []
     new = {some[i].id: some[j].annotation for i, j in pairs if i != j}
     if new and set(new.values()) == {one.annotation for one in some if one.id in new}:
         text = ", ".join(f"{name} has {number}" for name, number in new.items())
@@ -304,7 +293,7 @@ def _annotations(capture: Capture, found: Agreement) -> Iterator[Fault]:
                     change)  # fmt: skip
 
 
-def _lenses(capture: Capture, found: Agreement) -> Iterator[Fault]:
+def _lenses(capture: Capture, found: agree.Agreement) -> Iterator[Fault]:
     """Outlines fit boxes that are scaled and moved: another lens, another size, a crop."""
     camera, bodies, people = capture.scene.camera, capture.bodies, capture.people
     _, ours, theirs = _views(capture)
@@ -314,7 +303,7 @@ def _lenses(capture: Capture, found: Agreement) -> Iterator[Fault]:
     yield Fault(f"scene.json: sizes are {what} for the positions", cure, mend, FITTED_MARGIN)
     seen = masks = ours[:0]
     if bodies is not None and people is not None and len(people.frame):
-        rows = partners(bodies.frame, bodies.person, people)
+        rows = agree.partners(bodies.frame, bodies.person, people)
         seen, masks = found.boxes[rows >= 0], mask_boxes(people.masks)[rows[rows >= 0]]
     for file, what, some, others in (
         ("camera.json", "all", torch.cat([ours, seen]), torch.cat([theirs, masks])),
@@ -343,9 +332,9 @@ def _fitted(
         return 1.0, torch.zeros(2), 0.0
     pivot = torch.cat([pivot, pivot], -1)
     grown = pivot + SCALES[:, None, None] * (ours - pivot)
-    apart = theirs - in_image(grown, camera)
+    apart = theirs - agree.in_image(grown, camera)
     moves = ((apart[..., :2] + apart[..., 2:]) / 2).median(1).values
     moves = torch.cat([torch.zeros_like(moves), moves])
-    boxes = in_image(torch.cat([grown, grown]) + moves.repeat(1, 2)[:, None], camera)
+    boxes = agree.in_image(torch.cat([grown, grown]) + moves.repeat(1, 2)[:, None], camera)
     shared, best = iou2d(boxes, theirs.expand_as(boxes)).mean(1).max(0)
     return float(SCALES[int(best) % len(SCALES)]), moves[best], float(shared)

@@ -2,12 +2,10 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from numpy.typing import NDArray
 from torch import Tensor
 
 from mover.bodies import load_model, run_model
@@ -116,13 +114,6 @@ def into_camera(bodies: Bodies, R_cam_world: Float[Tensor, "3 3"]) -> Bodies:
     return dataclasses.replace(
         bodies, verts=bodies.verts @ R.mT, joints=joints, pose=pose, space="camera"
     )
-
-
-def pose_to_arrays(pose: BodyPose) -> dict[str, NDArray[Any]]:
-    """The arrays of a file."""
-    tensors = {key: getattr(pose, key) for key in NEEDED} | pose.extra
-    words = {"model": np.array(pose.model), "gender": np.array(pose.gender)}
-    return words | {key: value.detach().cpu().numpy() for key, value in tensors.items()}
 
 
 def joined_bodies(parts: Sequence[Bodies]) -> Bodies:

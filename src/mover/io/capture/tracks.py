@@ -64,7 +64,10 @@ def pair_tracks(bodies: Bodies, people: People, camera: Camera) -> TrackPairs:
     scores, margins = defaultdict[Any, list[float]](list), defaultdict[Any, list[float]](list)
     for frame in sorted({*bodies.frame.tolist()} & {*people.frame.tolist()}):
         a, b = ((one.frame == frame).nonzero()[:, 0] for one in (bodies, people))
-        fit = _overlaps(ours[a].double(), theirs[b])
+        shared = pairwise_iou2d(ours[a].double(), theirs[b])
+        areas = [(x[:, 2:] - x[:, :2]).prod(-1) for x in (ours[a].double(), theirs[b])]
+        inside = shared * (areas[0][:, None] + areas[1]) / (1 + shared)
+        fit = ((inside / areas[1].clamp_min(1e-9) + shared) / 2).numpy()  # share of mask, and union
         for i, j in np.ndindex(fit.shape):
             rival = max([0.0, *np.delete(fit[i], j), *np.delete(fit[:, j], i)])
             pair = int(bodies.person[a[i]]), int(people.person[b[j]])
@@ -120,16 +123,6 @@ def renumbered(person: Int[Tensor, " rows"], numbers: Mapping[int, int]) -> Int[
     return torch.tensor([numbers.get(one, one) for one in person.tolist()], dtype=person.dtype)
 
 
-def _overlaps(
-    ours: Float[Tensor, "bodies 4"], theirs: Float[Tensor, "masks 4"]
-) -> NDArray[np.float64]:
-    """How well each body fits each mask: the share of the mask's box inside, and the union."""
-    shared = pairwise_iou2d(ours, theirs)
-    first, second = ((x[:, 2:] - x[:, :2]).prod(-1) for x in (ours, theirs))
-    common = shared * (first[:, None] + second) / (1 + shared)
-    return ((common / second.clamp_min(1e-9) + shared) / 2).numpy()
-
-
 # Pieces of one person's track, as trackers leave them behind a pillar or at the image's border.
 
 
@@ -169,10 +162,11 @@ def join_pieces(
     for one in person.unique().tolist():
         own = (person == one).nonzero()[:, 0]
         own = own[frame[own].argsort()]
-        begins[one], ends[one] = (
-            _end(frame[part].numpy(), rows[part.numpy()])
-            for part in (own[:FEW], own[-FEW:].flip(0))
-        )
+        for found, part in ((begins, own[:FEW]), (ends, own[-FEW:].flip(0))):
+            when, there = frame[part].numpy(), rows[part.numpy()]
+            span = when[-1] - when[0]
+            speed = (there[-1, :3] - there[0, :3]) / span if span else np.zeros(3)
+            found[one] = _End(int(when[0]), there[0, :3], speed, there[:, 3:].mean(0))
     after = {a: [b for b in begins if _continues(ends[a], begins[b])] for a in ends}
     follows: dict[int, int] = {}
     for a, options in after.items():
@@ -190,13 +184,6 @@ def join_pieces(
         chain = ", ".join(map(str, [first, *(b for b in numbers if numbers[b] == first)]))
         notes.append(f"tracks {chain} follow one another in time and position: one person, {first}")
     return numbers, notes + _possible(begins, ends, follows)
-
-
-def _end(frame: NDArray[np.int64], rows: NDArray[np.float64]) -> _End:
-    """The first of these rows, with the motion that the others show."""
-    span = frame[-1] - frame[0]
-    speed = (rows[-1, :3] - rows[0, :3]) / span if span else np.zeros(3)
-    return _End(int(frame[0]), rows[0, :3], speed, rows[:, 3:].mean(0))
 
 
 def _continues(end: _End, begin: _End) -> bool:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mover.core.errors import InputError
 from mover.core.records import record
-from mover.core.types import Bodies, Scene
+from mover.core.types import Bodies, Scene, rows_by_person
 from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.scene_file import read_scene
 
@@ -94,10 +94,8 @@ def tracks_of(bodies: Bodies) -> list[Track]:
     first, fps = clock_of(bodies)
     last = (int(bodies.frame.max()) - first) / fps
     found: list[Track] = []
-    for person in bodies.person.unique().tolist():
-        rows = (bodies.person == person).nonzero()[:, 0]
-        rows = rows[torch.argsort(bodies.frame[rows])]
-        frame = bodies.frame[rows]
+    for rows in rows_by_person(bodies.frame, bodies.person):
+        person, frame = int(bodies.person[rows[0]]), bodies.frame[rows]
         found.append(Track(person, rows, frame, (frame - first).double() / fps, last))
     return found
 

@@ -14,11 +14,10 @@ from mover.core.types import Bodies, BodyPose
 from mover.geometry.rotations import axis_angle, rotation_vectors, similarity
 from mover.io.capture.pose_file import pelvis_of
 from mover.io.export.finished import BodyForm, Finished, tracks_of
+from mover.io.people.tools import HANDS
 
 SAME = 0.01  # [m], a similarity that leaves more did not make the result's body
 SKIN_MISS = 0.02  # [m], the most that a skinned body may miss the result's mesh
-EXTRA = {"jaw_pose": (66, 69), "left_hand_pose": (75, 120), "right_hand_pose": (120, 165)}
-"""Columns among the angles of SMPL-X's joints."""
 
 
 @record
@@ -69,7 +68,7 @@ def all_angles(pose: BodyPose) -> Float[Tensor, "bodies joints 3"]:
     rows = pose.global_orient.shape[0]
     angles = torch.zeros(rows, 165).to(pose.global_orient)
     angles[:, :3], angles[:, 3:66] = pose.global_orient, pose.body_pose[:, :63]
-    for name, (start, end) in EXTRA.items():
+    for name, (start, end) in HANDS["smplx"].items():
         given = pose.extra.get(name)
         if given is not None and given.shape[-1] == end - start:  # PCA weights of hands have less
             angles[:, start:end] = given

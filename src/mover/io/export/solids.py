@@ -139,15 +139,6 @@ class Convex:
     """About that centre, of a density of one [m^5]."""
 
 
-def convex_of(item: SceneObject, run: Run) -> Convex:
-    """The convex parts of an object's mesh at its initial size, kept in the result's folder."""
-    config = ConvexConfig("slices" if find_spec("coacd") is None else "best")
-    file, mesh = run.folder / "watertight" / f"{item.id}.glb", item.mesh
-    if file.is_file():  # the proxy that the run wrote
-        mesh, _ = read_mesh(At(file.name, "watertight", item.id), file.parent)
-    return run.stage(cut_into_convex, ConvexInputs(close_mesh(mesh)), config)
-
-
 def cut_into_convex(
     inputs: ConvexInputs, config: ConvexConfig, observe: Observer = silent
 ) -> Convex:
@@ -214,7 +205,6 @@ class Solid:
     """One object in the simulator's axes."""
 
     id: str
-    category: str
     position: Float[Tensor, "3"]
     """Of the mesh's origin; the floor is at zero [m]."""
     yaw: float
@@ -241,8 +231,15 @@ def floor_height(scene: Scene) -> float:
 
 def solids_of(scene: Scene, run: Run) -> tuple[Solid, ...]:
     """All objects of a scene; the folder of `run` keeps their convex parts."""
-    floor = floor_height(scene)
-    return tuple(_solid(item, convex_of(item, run), floor) for item in scene.objects)
+    floor, found = floor_height(scene), list[Solid]()
+    config = ConvexConfig("slices" if find_spec("coacd") is None else "best")
+    for item in scene.objects:
+        file, mesh = run.folder / "watertight" / f"{item.id}.glb", item.mesh
+        if file.is_file():  # the proxy that the run wrote
+            mesh, _ = read_mesh(At(file.name, "watertight", item.id), file.parent)
+        convex = run.stage(cut_into_convex, ConvexInputs(close_mesh(mesh)), config)
+        found.append(_solid(item, convex, floor))
+    return tuple(found)
 
 
 def _solid(item: SceneObject, convex: Convex, floor: float) -> Solid:
@@ -251,10 +248,13 @@ def _solid(item: SceneObject, convex: Convex, floor: float) -> Solid:
     position = position - torch.tensor([0.0, 0.0, floor], dtype=torch.float64)
     volume = abs(convex.volume) * float(scale.prod())
     mass = max(LEAST, volume * DENSITY.get(canonical(item.category), OTHER))
-    inertia = AXES @ _stretched(convex.inertia, scale) @ AXES.mT * mass / max(volume, 1e-9)
+    one = torch.eye(3, dtype=scale.dtype)  # of a solid that is stretched at the same density
+    spread = one * convex.inertia.trace() / 2 - convex.inertia
+    spread = spread * scale[:, None] * scale[None] * scale.prod()
+    stretched = one * spread.trace() - spread
+    inertia = AXES @ stretched @ AXES.mT * mass / max(volume, 1e-9)
     return Solid(
-        id=item.id, category=item.category, position=position, yaw=float(item.yaw),
-        free=item.support != "free",
+        id=item.id, position=position, yaw=float(item.yaw), free=item.support != "free",
         hulls=tuple(Mesh(h.verts.double() * scale @ AXES.mT, h.faces) for h in convex.hulls),
         mass=mass, centre=AXES @ (scale * convex.centre), inertia=_physical(inertia, mass),
     )  # fmt: skip
@@ -265,13 +265,6 @@ def moved_to(solid: Solid, item: SceneObject, frame: int) -> Solid:
     there = placed_at(item, frame)
     way = AXES @ (there.t_world_object - item.t_world_object).detach().cpu().double()
     return dataclasses.replace(solid, position=solid.position + way, yaw=float(there.yaw))
-
-
-def _stretched(inertia: Float[Tensor, "3 3"], scale: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """Inertia of a solid that is stretched along its axes, at the same density."""
-    spread = torch.eye(3, dtype=inertia.dtype) * inertia.trace() / 2 - inertia
-    spread = spread * scale[:, None] * scale[None] * scale.prod()
-    return torch.eye(3, dtype=inertia.dtype) * spread.trace() - spread
 
 
 def _physical(inertia: Float[Tensor, "3 3"], mass: float) -> Float[Tensor, "3 3"]:

@@ -24,11 +24,8 @@ LAST_ID = 1 << 62
 SLOWEST, FASTEST = 1e-3, 1e4  # frames a second
 
 
-class Missing:
-    """The value of a field that is not there."""
-
-
-MISSING = Missing()
+MISSING = object()
+"""The value of a field that is not there."""
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,8 @@ MOST_NODES = 10_000
 MOST_FACES = 5_000_000  # of all places of all meshes together: 8 s and 1.5 GB
 MOST_MATERIALS = 500  # of an .obj
 PACKED = {"KHR_draco_mesh_compression": "Draco", "EXT_meshopt_compression": "meshopt"}
+MAPS = re.compile(r"(?im)^\s*(?:map_\w+|bump|disp|decal|refl|norm)\s+(.+?)\s*$")
+"""A picture in a file of materials."""
 NUMBERED = {"-o": 3, "-s": 3, "-t": 3, "-mm": 2}
 """Options of a texture with up to so many numbers; all others have one word."""
 
@@ -184,8 +186,8 @@ def companions(path: Path) -> tuple[Path, ...]:
         found = [beside(path, name) for _, _, name in _uris(gltf_tree(path))]
     else:
         libraries = _libraries(_text(path), path)
-        named = [name for library in libraries for name in _maps(_text(library))]
-        found = [*libraries, *(beside(path, name) for name in named)]
+        lines = (line for library in libraries for line in MAPS.findall(_text(library)))
+        found = [*libraries, *(beside(path, _map(line)[0]) for line in lines)]
     home = path.parent.resolve()
     return tuple(dict.fromkeys(file.relative_to(home) for file in found if file is not None))
 
@@ -230,12 +232,6 @@ def _libraries(text: str, path: Path) -> list[Path]:
         whole = beside(path, name)
         found += [whole] if whole is not None else [beside(path, word) for word in name.split()]
     return [file for file in found if file is not None]
-
-
-def _maps(text: str) -> list[str]:
-    """The names of all pictures of a file of materials."""
-    pattern = r"^\s*(?:map_\w+|bump|disp|decal|refl|norm)\s+(.+?)\s*$"
-    return [_map(line)[0] for line in re.findall(pattern, text, re.MULTILINE | re.IGNORECASE)]
 
 
 def _map(line: str) -> tuple[str, bool]:

@@ -91,9 +91,7 @@ PLAIN: Mapping[Any, Callable[[At], Any]] = {
 }  # fmt: skip
 
 
-@functools.cache
-def _fields(kind: type[Struct]) -> tuple[msgspec.structs.FieldInfo, ...]:
-    return msgspec.structs.fields(kind)
+_fields = functools.cache(msgspec.structs.fields)
 
 
 def _tagged(at: At, kinds: list[type[Struct]]) -> type[Struct]:
