@@ -268,6 +268,11 @@ def test_other_spellings_of_a_mask_are_the_same_mask(drawn, tmp_path):
     assert (mask == walker(0)).all()
 
 
+def test_a_track_of_cvat_is_an_attribute(tmp_path):
+    (item,) = chair(tmp_path, [SQUARE], attributes={"track_id": 4, "occluded": False}).items
+    assert item.track == 4
+
+
 def test_polygons_in_shares_of_the_image_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"segmentation' has .* shares .*, expected pixels"):
         chair(tmp_path, [[0.1, 0.1, 0.5, 0.1, 0.5, 0.5]])

@@ -230,6 +230,13 @@ class RowFields(Struct, frozen=True):
     segmentation: Any = None
     mask: Any = None
     track_id: Index | None = None
+    attributes: Any = None
+
+    @property
+    def track(self) -> int | None:
+        """Where CVAT keeps it, if it is not with the rest."""
+        own = self.attributes.get("track_id") if isinstance(self.attributes, dict) else None
+        return own if self.track_id is None and type(own) is int and own >= 0 else self.track_id
 
 
 def coco_instances(
@@ -264,7 +271,7 @@ def coco_instances(
         at.get("annotations").refuse(f"at most {MOST_THINGS} in a picture", f"{len(rows)} items")
     need = "width and height, here or by --image"
     sizes = {i.id: i.size or size or item.refuse(need) for item, i in listed}
-    tracked = any(row.track_id is not None for _, row in rows)
+    tracked = any(row.track is not None for _, row in rows)
     frames, more = _frames_of_images([image for _, image in listed], at.file, tracked=tracked)
     found = [_instance(item, row, sizes[row.image_id or 0], words, frames) for item, row in rows]
     if len(set(sizes.values())) > 1:
@@ -365,7 +372,7 @@ def _instance(
         category=words.get(key, UNKNOWN) if row.name is None else str(row.name),
         box=None if box is None else tuple(box), mask=code_in(_drawn(at, row), size),
         score=1.0 if score is None else score,
-        frame=0 if row.image_id is None else frames[row.image_id], track=row.track_id,
+        frame=0 if row.image_id is None else frames[row.image_id], track=row.track,
     )  # fmt: skip
 
 
