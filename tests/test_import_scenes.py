@@ -101,10 +101,7 @@ def test_a_known_room_comes_back(plain, tmp_path, case):
     """SAM 3D's with the tilt of its objects, HolisticMesh's from the flipped picture."""
     tool, write, camera = ROOMS[case]
     hints = {} if camera is None else {"camera": camera(plain)}
-    source = write(tmp_path / "in", plain)
-    if tool == "sam3d":  # a mesh without a pose is passed over
-        (source / "scene.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    found = capture_of(tool, source, tmp_path, **hints)
+    found = capture_of(tool, write(tmp_path / "in", plain), tmp_path, **hints)
     assert worst(found, plain) < FINE
     assert tilt_error(found.scene.camera.R_cam_world, plain) < FINE
     assert [p.category for p in found.scene.objects] == [t.category for t in plain.things]

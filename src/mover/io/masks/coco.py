@@ -139,7 +139,7 @@ def _check_polygon(polygon: Any, reach: float, where: str, what: str) -> None:  
         _wrong(where, f"{what} {found}", f"numbers x, y of {CORNERS} corners or more")
     if not all(-reach <= v <= reach for v in given):
         _wrong(where, f"{what} a corner far outside", "pixels of the image")
-    if all(0 <= v <= 1 for v in given):
+    if all(0 <= v <= 1 for v in given) and any(0 < v < 1 for v in given):
         _wrong(where, f"{what} shares of the image (0 to 1)", "pixels: times width and height")
 
 

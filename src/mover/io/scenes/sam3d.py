@@ -76,8 +76,7 @@ def _things(folder: Path) -> tuple[list[Path], list[str]]:
     paths.sort(key=lambda p: (length[p], p.stem, kinds[p.suffix.lower()]))
     clouds = [path for path in paths if is_cloud(path)]
     meshes = [path for path in paths if path not in clouds]
-    posed = [p for p in meshes if any(p.with_suffix(kind).is_file() for kind in TREES)] or meshes
-    once = [p for k, p in enumerate(posed) if p.stem not in [other.stem for other in posed[:k]]]
+    once = [p for k, p in enumerate(meshes) if p.stem not in [other.stem for other in meshes[:k]]]
     if not once:
         found = f"{len(clouds)} files of points or splats, " if clouds else ""
         wanted = "expected <name>.glb with <name>.npz or .json"
@@ -86,8 +85,7 @@ def _things(folder: Path) -> tuple[list[Path], list[str]]:
         f"{listed('file', [p.name for p in passed])} {why}: passed over"
         for passed, why in (
             (clouds, "of points without faces, as Gaussian splats are"),
-            ([p for p in meshes if p not in posed], "without a pose beside (.npz or .json)"),
-            ([p for p in posed if p not in once], "of the name of another mesh"),
+            ([p for p in meshes if p not in once], "of the name of another mesh"),
         )
         if passed
     ]
