@@ -311,7 +311,7 @@ def test_a_missing_extra_is_one_sentence_before_anything_runs(tmp_path, capsys, 
     monkeypatch.setattr(run, "find_spec", lambda _: None)
     assert run_command("experiment", ["--seeds", "0", "--out", str(tmp_path)]) == 2
     said = capsys.readouterr().err
-    assert "pandas is not installed; pip install '.[bench]' in mover's folder" in said
+    assert "pandas is not installed; pip install -e '.[bench]' in mover's folder" in said
     assert not list(tmp_path.iterdir())
 
 

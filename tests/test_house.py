@@ -24,13 +24,13 @@ LINES = {
     "src/mover/fitting": 2_097,
     "src/mover/furniture": 955,
     "src/mover/geometry": 3_523,
-    "src/mover/io": 10_614,
+    "src/mover/io": 10_620,
     "src/mover/perceive": 2_865,
     "src/mover/pipeline": 1_227,
     "src/mover/stages": 6_132,
     "bench": 7_557,
     "benchmarks": 1_119,
-    "tests": 29_861,
+    "tests": 29_863,
 }
 FILES = {"src/mover": 239, "bench": 41}
 LIMITS = {

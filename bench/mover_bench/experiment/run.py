@@ -63,7 +63,7 @@ def run_experiment(args: ExperimentArgs, observe: Observer = silent, pool: Pool 
         InputError: If a seed, a variant or a set is none, or pandas is not installed.
     """
     if find_spec("pandas") is None:
-        raise InputError("pandas is not installed; pip install '.[bench]' in mover's folder")
+        raise InputError("pandas is not installed; pip install -e '.[bench]' in mover's folder")
     seeds, names = parse_seeds(args.seeds), names_in(args.variants)
     set_named(args.set)
     open_seeds = [

@@ -217,7 +217,7 @@ def on_ray(jobs: Sequence[BatchJob], workers: int, share: RayOptions) -> Iterato
     """
     if find_spec("ray") is None:
         raise InputError(
-            "--engine ray: ray is not installed; pip install '.[ray]' in mover's folder"
+            "--engine ray: ray is not installed; pip install -e '.[ray]' in mover's folder"
         )
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     ray: Any = import_module("ray")

@@ -46,7 +46,7 @@ def lacking() -> str | None:
     """What has to be installed for a simulation; None: nothing."""
     if find_spec("mujoco") is not None:
         return None
-    return "mujoco is not installed; pip install '.[physics]' in mover's folder"
+    return "mujoco is not installed; pip install -e '.[physics]' in mover's folder"
 
 
 def settle(scene: Scene, run: Run, seconds: float = SECONDS) -> tuple[Settled, ...]:

@@ -53,7 +53,7 @@ def video_library(why: str) -> Any:  # noqa: ANN401
         InputError: If it is not installed; `why` says what needs it.
     """
     if find_spec("av") is None:
-        raise InputError(f"{why}: PyAV is not installed; pip install '.[render]' in mover's folder")
+        raise InputError(f"{why}: needs PyAV; pip install -e '.[render]' in mover's folder")
     import av
 
     return av

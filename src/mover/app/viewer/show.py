@@ -34,7 +34,7 @@ def open_viewer(session: Session, port: int) -> tuple[RoomWindow, str]:
         import viser  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise InputError(
-            "mover view needs viser: pip install '.[viewer]' in mover's folder"
+            "mover view needs viser: pip install -e '.[viewer]' in mover's folder"
         ) from error
     with contextlib.redirect_stdout(io.StringIO()), guarded():
         server = viser.ViserServer(

@@ -132,14 +132,15 @@ def contact_frames(capture: Capture, masks: Sequence[Masks | None]) -> list[int]
 
 def _shrunk(grid: Grid) -> Grid:
     """Without its border: masks and bodies are rarely right to the pixel."""
-    from scipy.ndimage import binary_erosion
+    import cv2
 
-    return np.asarray(binary_erosion(grid, iterations=BORDER, border_value=1), dtype=np.bool_)
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    return cv2.erode(grid.astype(np.uint8), cross, iterations=BORDER) > 0
 
 
 def _silhouette(bodies: Bodies, row: int, camera: Camera, step: int) -> Grid:
     """A body's projection, from its vertices, without gaps of a cell; on the grid."""
-    from scipy.ndimage import binary_closing
+    import cv2
 
     verts: Float[Tensor, "points 3"] = bodies.verts[row]
     if len(verts) < ENOUGH:
@@ -151,10 +152,10 @@ def _silhouette(bodies: Bodies, row: int, camera: Camera, step: int) -> Grid:
     rows, columns = (len(range(step // 2, n, step)) for n in (camera.height, camera.width))
     inside = ((cells >= 0) & (cells < torch.tensor([columns, rows]))).all(1)
     x, y = cells[inside].numpy().T
-    grid = np.zeros((rows + 2, columns + 2), dtype=np.bool_)
-    grid[y + 1, x + 1] = True
-    closed = np.asarray(binary_closing(grid, np.ones((3, 3))), dtype=np.bool_)
-    return closed[1:-1, 1:-1]
+    grid = np.zeros((rows + 2, columns + 2), dtype=np.uint8)
+    grid[y + 1, x + 1] = 1
+    closed = cv2.morphologyEx(grid, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    return closed[1:-1, 1:-1] > 0
 
 
 def evidence_table(capture: Capture, evidence: Sequence[ObjectEvidence]) -> str:

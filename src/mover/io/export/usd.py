@@ -42,7 +42,7 @@ def pxr(name: str) -> Any:  # noqa: ANN401
         InputError: If usd-core is not installed.
     """
     if find_spec("pxr") is None:
-        cure = "pip install '.[usd]' in mover's folder"
+        cure = "pip install -e '.[usd]' in mover's folder"
         raise InputError(f"--to usd: usd-core is not installed; {cure}")
     return import_module(f"pxr.{name}")
 
