@@ -15,10 +15,10 @@ import pytest
 
 HOME = Path(__file__).parents[1]
 LINES = {
-    "src/mover/app": 4_296,
+    "src/mover/app": 4_294,
     "src/mover/bodies": 2_041,
     "src/mover/core": 1_595,
-    "src/mover/energy": 3_818,
+    "src/mover/energy": 3_814,
     "src/mover/evaluate": 1_027,
     "src/mover/extensions": 1_235,
     "src/mover/fitting": 2_097,
@@ -26,18 +26,18 @@ LINES = {
     "src/mover/geometry": 3_523,
     "src/mover/io": 10_620,
     "src/mover/perceive": 2_865,
-    "src/mover/pipeline": 1_227,
+    "src/mover/pipeline": 1_225,
     "src/mover/stages": 6_132,
     "bench": 7_557,
     "benchmarks": 1_119,
-    "tests": 29_863,
+    "tests": 29_850,
 }
 FILES = {"src/mover": 239, "bench": 41}
 LIMITS = {
     "words in code": 0,
     "words in pages": 0,
     "class names with two meanings": 0,
-    "small helpers": 64,
+    "small helpers": 65,
     "modules in circles": 0,
 }  # fmt: skip
 WORDS = {

@@ -58,19 +58,6 @@ def test_the_table_of_the_docs_has_each_reading_with_its_setting():
     assert rows == {name: list(way)[-1] for name, way in READINGS.items()}
 
 
-def test_the_silhouette_has_its_value_and_a_steeper_gradient():
-    layout = off()
-    free = layout.t_world_object.clone().requires_grad_()
-    found = [
-        energy("silhouette", replace(layout, t_world_object=free), silhouette=way).total
-        for way in ("exact", "renderer")
-    ]
-    one, two = (torch.autograd.grad(x, free)[0] for x in found)
-    torch.testing.assert_close(found[0], found[1])
-    assert bool(one.any())
-    torch.testing.assert_close(two, 12 * one)
-
-
 def test_bounds_that_contradict_each_other_cost_twice():
     depth = INPUTS.humans.depth
     crossed = replace(depth, near=depth.near + 0.3)  # 10 cm before and 20 cm behind the surface

@@ -53,8 +53,6 @@ class Readings:
     See "Readings of the paper" in docs/method.md.
     """
 
-    silhouette: Literal["exact", "renderer"] = "exact"
-    """The gradient of L_occ-sil: exact, or as steep as the renderer's of lambda_2."""
     contradiction: Literal["skip", "count"] = "skip"
     """Pixels whose near bound is beyond the far one have no range, or two costs."""
     surface: Literal["samples", "vertices"] = "samples"

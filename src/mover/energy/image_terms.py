@@ -79,19 +79,18 @@ def silhouette_term(
     mask: Float[Tensor, "objects h w"],
     keep: Bool[Tensor, "objects h w"],
     form: Variant,
-    steeper: float = 1.0,
 ) -> Float[Tensor, "*starts objects"]:
     """Squared difference between drawn and detected masks [px], or per mask pixel (`robust`).
 
     `mask` is that in a square window around the object's box; `keep` is False where another
     object, or a person, may hide this one, and beyond the border of the image. The gradient is
-    exact, times `steeper` (`paper`).
+    exact (`robust`), or as steep as that of the renderer for which the weight was printed.
     """
     gap = torch.where(keep, drawn - mask, 0.0).flatten(-2)
     cost = (gap.unsqueeze(-2) @ gap.unsqueeze(-1))[..., 0, 0]
     if form == "robust":
         return cost / (mask * keep).sum((-2, -1)).clamp_min(1)
-    return cost if steeper == 1 else cost + (steeper - 1) * (cost - cost.detach())
+    return cost + (RENDERER - 1) * (cost - cost.detach())
 
 
 # --- Borders: outlines of masks are too wide or too narrow by about the same all round -----------

@@ -170,9 +170,8 @@ def _silhouette(s: PlacedScene) -> PerItem:
     image = s.known.image
     if s.loose:
         return s.fitted.silhouette
-    steeper = picture.RENDERER if s.config.readings.silhouette == "renderer" else 1.0
-    form, drawn = s.config.form, s.silhouettes
-    return image.trust * picture.silhouette_term(drawn, image.masks, image.keep, form, steeper)
+    own = image.masks, image.keep, s.config.form
+    return image.trust * picture.silhouette_term(s.silhouettes, *own)
 
 
 def _depth(s: PlacedScene) -> PerItem:

@@ -98,8 +98,6 @@ PAPER = Config(
 Settings = Mapping[str, Any]
 """Values by the dotted names of their settings."""
 READINGS: Mapping[str, Settings] = MappingProxyType({
-    "silhouette": {"layout.readings.silhouette": "renderer",
-                   "place.readings.silhouette": "renderer"},
     "near bound": {"gather.near": "far side"},
     "both bounds": {"gather.vote": False},
     "borders": {"gather.erode": 0},

@@ -72,8 +72,6 @@ RUN_SETTINGS = {
     "prepare.regions": "What of the furniture can be touched.",
     "align.votes": "What counts once for the floor.",
     "contacts.given": "Use contacts.npz of the capture.",
-    "layout.readings.silhouette": "How steep silhouettes are before people are used (`paper`).",
-    "place.readings.silhouette": "How steep silhouettes are (`paper`).",
     "place.readings.contradiction": "What pixels cost whose bounds cross (`paper`).",
     "place.readings.surface": "What of an object may not be inside people (`paper`).",
     "place.readings.lookup": "How the free space is looked up (`paper`).",
