@@ -254,7 +254,7 @@ def test_captures_of_one_name_get_different_folders():
 def test_without_ray_the_way_to_get_it_is_said_and_the_summary_has_its_head(tmp_path, monkeypatch):
     monkeypatch.setattr("mover.app.batch.find_spec", lambda _: None)
     fakes(tmp_path, 1, {})
-    with pytest.raises(InputError, match=r"ray is not installed; pip install '\.\[ray\]'"):
+    with pytest.raises(InputError, match=r"ray is not installed; pip install -e '\.\[ray\]'"):
         run_batch(jobs_of(tmp_path), tmp_path / "out", 1, RayOptions())
     assert states(tmp_path) == {"capture_00": "open"}
     run_batch([], tmp_path, 1)
