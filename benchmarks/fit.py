@@ -13,10 +13,11 @@ import argparse
 import torch
 from torch import Tensor
 
-from mover.bodies.skinning import open_body, shaped
-from mover.core.types import Camera, Keypoints, People
+from mover.bodies.corrected import statures
+from mover.bodies.skinning import open_body
+from mover.core.types import Bodies, Camera, Keypoints, People
 from mover.evaluate.bodies import procrustes
-from mover.fitting.bodies import FitInputs, Fitted, fit_bodies
+from mover.fitting.bodies import FitInputs, fit_bodies
 from mover.geometry.camera import project
 from mover.perceive.config import ModelsConfig
 from mover.perceive.networks import JointsInputs
@@ -62,22 +63,11 @@ def postures(room: KnownRoom, rows: list[int]) -> dict[str, list[int]]:
     }
 
 
-def stature(room: KnownRoom) -> tuple[float, ...]:
-    """How tall the people are [m]."""
-    assert room.bodies.pose is not None
-    people = room.bodies.person.unique()
-    first = [int((room.bodies.person == one).nonzero()[0, 0]) for one in people]
-    y = shaped(open_body(), room.bodies.pose.betas[first].float())[0][..., 1]
-    return tuple((y.amax(-1) - y.amin(-1)).tolist())
-
-
-def too_tall(found: Fitted, heights: tuple[float, ...]) -> Tensor:
-    """How much taller than they are people were fitted [%]."""
-    assert found.bodies.pose is not None
-    people = found.bodies.person
-    first = [int((people == one).nonzero()[0, 0]) for one in people.unique()]
-    y = shaped(open_body(), found.bodies.pose.betas[first].float())[0][..., 1]
-    return 100 * ((y.amax(-1) - y.amin(-1)) / torch.tensor(heights) - 1)
+def heights_in(bodies: Bodies) -> Tensor:
+    """How tall each of the people is [m]."""
+    tall = None if bodies.pose is None else statures(bodies.pose)
+    assert tall is not None, "of the open body"
+    return torch.stack([tall[bodies.person == one][0] for one in bodies.person.unique()])
 
 
 def misses(joints: Tensor, truth: Tensor) -> Tensor:
@@ -91,8 +81,10 @@ def by_posture(seed: int, fps: float, tall: bool) -> tuple[dict[str, Tensor], Te
     """Absolute and Procrustes-aligned PJE of bodies by posture [mm], and errors of heights [%]."""
     room = make_room(seed, RoomConfig(fps=fps))
     keypoints, camera = detected(room, seed, fps)
-    heights = stature(room)
-    inputs = FitInputs(keypoints, camera, open_body(), heights=heights if tall else ())
+    heights = heights_in(room.bodies)
+    inputs = FitInputs(
+        keypoints, camera, open_body(), heights=tuple(heights.tolist()) if tall else ()
+    )
     found = fit_bodies(inputs)
     where = {int(f): k for k, f in enumerate(room.bodies.frame.tolist())}
     rows = [where[f] for f in found.bodies.frame.tolist()]
@@ -103,7 +95,7 @@ def by_posture(seed: int, fps: float, tall: bool) -> tuple[dict[str, Tensor], Te
     means = ", ".join(
         f"{n} {len(v)}: {v[:, 0].mean():.0f} / {v[:, 1].mean():.0f}" for n, v in each.items()
     )
-    off = too_tall(found, heights)
+    off = 100 * (heights_in(found.bodies) / heights - 1)
     print(f"room {seed}: {means}, height {off.mean():+.1f} %", flush=True)
     return each, off
 

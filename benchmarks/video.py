@@ -20,9 +20,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from fit import misses, postures, stature
+from fit import heights_in, misses, postures
 
-from mover.app.cli.config import preset_named
 from mover.app.cli.run import reconstruct_into
 from mover.app.cli.video import VideoArgs, video_to_room
 from mover.app.results import Origin
@@ -41,6 +40,7 @@ from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.folder import read_capture
 from mover.io.capture.scene_file import read_scene
 from mover.io.files.meshes import write_mesh
+from mover.pipeline.presets import PRESETS
 from mover_bench.experiment.sets import parse_seeds
 from mover_bench.rooms.config import NoiseConfig, RoomConfig
 from mover_bench.rooms.known import KnownRoom, make_room
@@ -209,7 +209,7 @@ def trial(seed: int, out: Path, args: argparse.Namespace) -> dict[str, Any]:
         write_video(room, out / "video.mp4")
     seen = Seen(room, add_noise(room, NoiseConfig(), seed), seed)
     meshes = other_designs(room, out / "meshes") if args.other_designs else None
-    heights = stature(room) if args.height else ()
+    heights = tuple(heights_in(room.bodies).tolist()) if args.height else ()
     lens = lens_file(room, out)
     chain = VideoArgs(out / "video.mp4", out / "chain", camera=lens, meshes=meshes, height=heights)
     video_to_room(chain, seen.finders())
@@ -219,7 +219,7 @@ def trial(seed: int, out: Path, args: argparse.Namespace) -> dict[str, Any]:
         if kind:
             measured(room, seed, kind, capture)
             origin = Origin(str(capture), refine=True, device=torch.device("cpu"))
-            reconstruct_into(place, read_capture(capture), preset_named("robust"), origin)
+            reconstruct_into(place, read_capture(capture), PRESETS["robust"], origin)
             shutil.rmtree(capture / kind)
         metrics, word = judged(capture, place, room), f"{kind} ".lstrip()
         print(f"room {seed} {kind}", lines_of_objects(metrics), sep="\n", flush=True)

@@ -15,10 +15,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mover.app.cli.video import VideoArgs, video_to_room
+from mover.bodies.corrected import statures
 from mover.bodies.keypoints import keypoints_of
 from mover.bodies.parts import BodyParts, members, parts_of
 from mover.bodies.posture import postures
-from mover.bodies.skinning import open_body
+from mover.bodies.skinning import heights_of, open_body
 from mover.core.errors import InputError
 from mover.core.observe import Observer, Step, silent
 from mover.core.types import Bodies, Scene, SceneObject
@@ -34,7 +35,7 @@ from mover.io.people.keypoints import read_keypoints
 from mover.perceive.capture import read_picture_of
 from mover.perceive.layout import Picture
 from mover_bench.cli import ExperimentArgs
-from mover_bench.experiment.tables import markdown, stature, write_summary
+from mover_bench.experiment.tables import markdown, write_summary
 
 VIEW = 65.0  # [degrees], horizontal, of a clip whose lens was not measured
 STEP_UP = 0.15  # [m] that a seat may reach into its sitter and still be below
@@ -87,10 +88,11 @@ def judge_room(folder: Path) -> dict[str, Any]:
     soles = bodies.verts[:, members(parts, "left_sole", "right_sole"), 1].amin(1)
     on_feet = pose.standing | pose.sitting
     off = 100 * (soles[on_feet] - (scene.ground or 0.0))
-    tall = None if bodies.pose is None else round(stature(bodies.pose.betas[0]), 3)
+    of_shapes = None if bodies.pose is None else statures(bodies.pose)
+    tall = None if of_shapes is None else round(float(of_shapes[0]), 3)
     rows = [row_of(thing, scene, picture, bodies, parts) for thing in scene.objects]
     return {
-        "stature": tall, "miss": miss_of(capture, tall or stature(torch.zeros(1))),
+        "stature": tall, "miss": miss_of(capture, tall or heights_of(open_body())[0]),
         "sole": round(float(off.abs().median()), 1) if len(off) else None, "objects": rows,
     }  # fmt: skip
 

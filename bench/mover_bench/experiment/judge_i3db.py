@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from mover.bodies.corrected import statures
 from mover.bodies.skinning import open_body
 from mover.core.errors import InputError
 from mover.core.observe import Observer, Step, silent
@@ -26,7 +27,7 @@ from mover.pipeline.presets import PRESETS
 from mover.pipeline.reconstruct import reconstruct
 from mover_bench.cli import ExperimentArgs
 from mover_bench.datasets.i3db import I3dbScene, read_i3db
-from mover_bench.experiment.tables import markdown, stature, write_summary
+from mover_bench.experiment.tables import markdown, write_summary
 
 LEVEL = tilted(torch.tensor(0.0), torch.tensor(0.0))
 POINTS = 1  # of surfaces, which are not compared
@@ -78,10 +79,11 @@ def judge_scene(scene: I3dbScene, run: Run, preset: str) -> dict[str, Any]:
     camera = replace(scene.truth.camera, R_cam_world=LEVEL)  # its tilt is not given
     model = open_body()
     bodies = fit_bodies(FitInputs(scene.keypoints, camera, model)).bodies
-    assert bodies.pose is not None
+    tall = None if bodies.pose is None else statures(bodies.pose)
+    assert tall is not None, "of the open body"
     first = first_scene(seen_from(picture_of(scene, camera), bodies, run), LayoutConfig(), run)
     numbers: dict[str, Any] = {
-        "stature": stature(bodies.pose.betas[0]),
+        "stature": float(tall[0]),
         **overlaps("first", first.scene.objects, scene),
         **overlaps("imapper", by_kind(scene.imapper, scene.truth.objects), scene),
     }

@@ -11,11 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
 
 from mover.app.batch import last_line, read_tree
 from mover.app.report.tables import SHOWN, shown
-from mover.bodies.skinning import heights_of, open_body
 from mover.core.files import replacing
 from mover.core.records import plain
 from mover.evaluate.evaluation import METRICS
@@ -57,12 +55,6 @@ def write_summary(folder: Path, found: Mapping[str, Any], text: str) -> Path:
         with replacing(folder / name) as part:
             part.write_text(content)
     return folder / "summary.md"
-
-
-def stature(betas: Float[Tensor, " shape"]) -> float:
-    """How tall the open body of a shape is [m]."""
-    usual, growth = heights_of(open_body())
-    return usual + float(betas @ growth[: len(betas)])
 
 
 class Interval(NamedTuple):
