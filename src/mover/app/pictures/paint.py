@@ -6,7 +6,7 @@ A sheet is a picture of four channels: colour times opacity, and opacity.
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, max_pool2d, normalize
+from torch.nn.functional import avg_pool2d, normalize
 
 from mover.core.colours import colour, person_colour
 from mover.core.records import record
@@ -15,6 +15,7 @@ from mover.geometry.camera import to_camera
 from mover.geometry.mesh import face_normals, vertex_normals
 from mover.geometry.placement import place_object
 from mover.geometry.raster import first_hit
+from mover.stages.masks import widened
 
 FINE = 2  # drawn at twice the size and averaged: smooth edges
 LIGHT = (0.35, 0.85, 0.40)  # from where a lamp shines, in the world
@@ -161,8 +162,7 @@ def _lines(drawn: Drawn, thickness: int) -> tuple[Bool[Tensor, "h w"], Bool[Tens
         outline.narrow(axis, 1, n).logical_or_(border)
         stiff = (first != NO_OWNER) & (first < PERSON)
         crease.narrow(axis, 0, n).logical_or_(bent & ~border & stiff)
-    wide = max_pool2d(outline[None, None].float(), 2 * thickness - 1, 1, thickness - 1)[0, 0] > 0
-    return wide & (drawn.owner != NO_OWNER), crease
+    return widened(outline[None], thickness - 1)[0] & (drawn.owner != NO_OWNER), crease
 
 
 def floor_points(camera: Camera, height: float) -> Float[Tensor, "h w 3"]:

@@ -13,6 +13,7 @@ from mover.bodies.corrected import in_world
 from mover.bodies.parts import members, parts_of
 from mover.bodies.posture import touching
 from mover.core.types import Bodies, Camera, Capture, Masks
+from mover.energy.human_terms import eroded
 from mover.geometry.camera import NEAR, project
 from mover.geometry.rle import area, decode, thinned
 
@@ -132,10 +133,7 @@ def contact_frames(capture: Capture, masks: Sequence[Masks | None]) -> list[int]
 
 def _shrunk(grid: Grid) -> Grid:
     """Without its border: masks and bodies are rarely right to the pixel."""
-    import cv2
-
-    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
-    return cv2.erode(grid.astype(np.uint8), cross, iterations=BORDER) > 0
+    return eroded(torch.from_numpy(grid), BORDER).numpy()
 
 
 def _silhouette(bodies: Bodies, row: int, camera: Camera, step: int) -> Grid:

@@ -16,7 +16,7 @@ from mover.core.errors import InputError
 from mover.core.records import fingerprint, rows_of
 from mover.core.types import Bodies, Camera, Capture, Scene
 from mover.furniture.library import canonical
-from mover.io.capture import agreement
+from mover.io.capture import agreement as agree
 from mover.io.capture.annotations_file import detections_of, people_of
 from mover.io.capture.bodies_file import bodies_of, bodies_to_arrays, write_bodies
 from mover.io.capture.build import build_capture
@@ -210,12 +210,12 @@ def pair_rows(ours: Rows, theirs: Rows) -> dict[int, int]:
         return {}
     boxes = [np.array([row["bbox"] for row in side], dtype=np.float64) for side in (ours, theirs)]
     a, b = (torch.from_numpy(box + np.pad(box[:, :2], ((0, 0), (2, 0)))) for box in boxes)
-    shared = agreement.pairwise_iou2d(a, b).numpy()
+    shared = agree.pairwise_iou2d(a, b).numpy()
     names, others = ([row["category_id"] for row in side] for side in (ours, theirs))
     same = np.array([[UNKNOWN in (x, y) or canonical(x) == canonical(y) for y in others]
                      for x in names])  # fmt: skip
     gain = np.where(shared >= np.where(same, LEAST, OTHER_CLASS), shared + same, 0.0)
-    return dict(agreement.assigned(torch.from_numpy(gain), LEAST))
+    return dict(agree.assigned(torch.from_numpy(gain), LEAST))
 
 
 def linked(scene: Scene, at: At) -> dict[str, int]:
@@ -227,8 +227,8 @@ def linked(scene: Scene, at: At) -> dict[str, int]:
     used = {p.annotation for p in scene.objects}
     free = [row for row in named_rows(at) if row["id"] not in used]
     bare: list[dict[str, Any]] = []
-    pieces = [agreement.outermost(piece) for piece in scene.objects if piece.annotation is None]
-    boxes = agreement.in_image(agreement.outlines(pieces, scene.camera), scene.camera).tolist()
+    pieces = [agree.outermost(piece) for piece in scene.objects if piece.annotation is None]
+    boxes = agree.in_image(agree.outlines(pieces, scene.camera), scene.camera).tolist()
     for piece, (x, y, right, bottom) in zip(pieces, boxes, strict=True):
         if x < right and y < bottom:
             size = [x, y, right - x, bottom - y]
@@ -265,16 +265,12 @@ def _check_apart(whole: Parts) -> Iterator[str]:
         raise InputError(f"{whole.name}: has no camera, expected --camera FILE or --fov DEGREES")
     if camera is not None and whole.objects is not None:
         found = detections_of(whole.objects, camera, ignored.append)
-        inside = agreement.bounded([one.mask for one in found if one.mask is not None])
+        inside = agree.bounded([one.mask for one in found if one.mask is not None])
         if len(inside) and inside.mean() < MOST:
             yield f"{whole.objects.file}: most masks fill the picture to its borders; inverted?"
     if camera is not None and whole.people is not None:
         people = people_of(whole.people, camera, ignored.append).people
-        if (
-            people is not None
-            and len(people.frame)
-            and agreement.bounded([people.masks]).mean() < MOST
-        ):
+        if people is not None and len(people.frame) and agree.bounded([people.masks]).mean() < MOST:
             yield f"{whole.people.file}: most masks fill the picture to its borders; inverted?"
 
 

@@ -43,8 +43,9 @@ SHAPES = 10  # coefficients where none are given
 FOCAL = 5000.0  # [px], SMPLify-X's default, and of HMR2's crops
 CROP = 256.0  # [px], a side of these crops
 AMASS = {156: "smplh", 165: "smplx", 72: "smpl"}
-AMASS_PARTS = {"root_orient": 3, "pose_body": 63, "pose_jaw": 3, "pose_eye": 6, "pose_hand": 90}
 """Body models by the numbers of a row of `poses`."""
+AMASS_PARTS = {"root_orient": 3, "pose_body": 63, "pose_jaw": 3, "pose_eye": 6, "pose_hand": 90}
+"""What newer files have in its place, and the numbers of a row of each."""
 NO_CAMERA = "is a motion in a world of its own: where the camera saw the people is not known"
 Y_UP = np.array([[1, 0, 0, 0, 0, 1, 0, -1, 0]])  # AMASS has +z up
 
