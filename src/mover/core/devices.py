@@ -4,6 +4,7 @@ from functools import cache
 from typing import Any, Literal
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from mover.core.errors import InputError
@@ -44,3 +45,14 @@ def constant(values: Any, like: Tensor) -> Tensor:  # noqa: ANN401
 
 
 _made = cache(torch.tensor)
+
+
+def least_squares(left: Float[Tensor, "rows unknowns"], right: Tensor) -> Tensor:
+    """The x of least |left @ x - right|, to the same bits each time, for one column or more.
+
+    The default driver of `torch.linalg.lstsq` on the processor (gelsy) reads pivots that are
+    not set: its last bits, and the search that starts from them, differ from run to run.
+    """
+    driver = "gelsd" if left.device.type == "cpu" else "gels"  # all that CUDA has
+    columns = right.reshape(len(right), -1)
+    return torch.linalg.lstsq(left, columns, driver=driver).solution.reshape(-1, *right.shape[1:])

@@ -73,7 +73,13 @@ def sample_nearest(
 
 
 def depth_in(mask: np.ndarray) -> np.ndarray:
-    """Distance of each pixel of a mask from the nearest one outside of it; 0 there [px]."""
+    """Distance of each pixel of a mask from the nearest one outside of it; 0 there [px].
+
+    To the same bits each time: squares are whole numbers, OpenCV's last bits depend on where the
+    picture lies in memory.
+    """
     import cv2
 
-    return cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    found = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    np.square(found, out=found)
+    return np.sqrt(np.rint(found, out=found), out=found)

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mover.core.devices import least_squares
 from mover.core.types import Camera
 from mover.geometry.rotations import axis_angle
 from mover.io.files.fields import At
@@ -78,8 +79,7 @@ def lens_of(points: Float[Tensor, "points 3"], pixels: Float[Tensor, "points 2"]
     left = torch.cat(
         [torch.stack([rays[:, 0], one, none], 1), torch.stack([rays[:, 1], none, one], 1)]
     )
-    right = pixels.double().T.reshape(-1, 1)
-    f, cx, cy = torch.linalg.lstsq(left, right).solution[:, 0].tolist()
+    f, cx, cy = least_squares(left, pixels.double().T.flatten()).tolist()
     return lens(f, f, cx, cy)
 
 
