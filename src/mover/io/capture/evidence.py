@@ -82,6 +82,7 @@ def passing_people(
     grids = np.stack([np.zeros(shape, np.bool_) if m is None else thinned(m, 0, step)
                       for m in masks]) if masks else np.zeros((0, *shape), np.bool_)  # fmt: skip
     near, far, frames = np.zeros_like(grids), np.zeros_like(grids), [set[int]() for _ in masks]
+    covers = grids.reshape(len(masks), shape[0] * shape[1]).astype(np.float32)
     rows: dict[tuple[int, int], int] = {}
     if bodies is not None:
         pairs = zip(bodies.frame.tolist(), bodies.person.tolist(), strict=True)
@@ -92,17 +93,18 @@ def passing_people(
         visible = [thinned(people.masks, i, step) for i in shown]
         hidden = _shrunk(~np.any(visible, axis=0))
         for i, own in zip(shown, visible, strict=True):
-            for k in np.flatnonzero((grids & own).any((1, 2))):
+            row, layers = rows.get((frame, int(people.person[i]))), [own]
+            if bodies is not None and row is not None:
+                body = _silhouette(bodies, row, camera, step)
+                layers += [own & body, _shrunk(body) & hidden]
+            shares = covers @ np.stack(layers).reshape(len(layers), -1).T  # whole numbers of cells
+            for k in np.flatnonzero(shares[:, 0]):
                 frames[k].add(frame)
-            row = rows.get((frame, int(people.person[i])))
-            if bodies is None or row is None:
-                continue
-            body = _silhouette(bodies, row, camera, step)
-            before, behind = grids & own & body, grids & _shrunk(body) & hidden
-            more = before.sum((1, 2)) - behind.sum((1, 2))  # it hides or is hidden, not both
-            near |= before & (more > 0)[:, None, None]
-            far |= behind & (more < 0)[:, None, None]
-    pixels = ((found.sum((1, 2)) * step**2).tolist() for found in (near, far))
+            if len(layers) == 3:
+                more = shares[:, 1] - shares[:, 2]  # it hides or is hidden, not both
+                near[more > 0] |= layers[1]
+                far[more < 0] |= layers[2]
+    pixels = (((found & grids).sum((1, 2)) * step**2).tolist() for found in (near, far))
     return *pixels, [len(found) for found in frames]
 
 
@@ -120,15 +122,19 @@ def contact_frames(capture: Capture, masks: Sequence[Masks | None]) -> list[int]
         world = in_world(bodies, camera)
         chance = touching(world, parts, float(world.verts[..., 1].amin(1).quantile(0.05)))
     chance = chance * ~members(parts, "left_sole", "right_sole")
-    shapes = [None if mask is None else decode(mask, 0) for mask in masks]
-    frames = [set[int]() for _ in masks]
-    for row, verts in enumerate(bodies.verts):
-        x, y = project(verts[chance[row] > UNSURE], camera.K).long().unbind(-1)
-        shown = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-        for i, shape in enumerate(shapes):
-            if shape is not None and int(shape[y[shown], x[shown]].sum()) >= FEWEST:
-                frames[i].add(int(bodies.frame[row]))
-    return [len(f) for f in frames]
+    touched = [project(v[c > UNSURE], camera.K) for v, c in zip(bodies.verts, chance, strict=True)]
+    x, y = torch.cat(touched).long().unbind(-1)
+    row = torch.arange(len(touched)).repeat_interleave(torch.tensor([*map(len, touched)]))
+    shown = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    x, y, row = x[shown], y[shown], row[shown]
+
+    def frames_in(mask: Masks | None) -> int:
+        if mask is None:
+            return 0
+        inside = row[decode(mask, 0)[y, x]].bincount(minlength=len(bodies.frame))
+        return len(bodies.frame[inside >= FEWEST].unique())
+
+    return [frames_in(mask) for mask in masks]
 
 
 def _shrunk(grid: Grid) -> Grid:
