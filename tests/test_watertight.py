@@ -139,6 +139,14 @@ def test_a_tub_stays_open_at_its_top():
     assert above > 0.1
 
 
+def test_open_tubs_in_one_another_are_closed():
+    """Their winding numbers add up: beyond the opening it is that of matter, up to the border."""
+    tubs = [block((1.0, 0.6, 0.5 - 0.01 * k)) for k in range(4)]
+    lids = [(t.verts[t.faces][..., 1] > 0).all(-1) for t in tubs]
+    soup = joined(*(Mesh(t.verts, t.faces[~lid]) for t, lid in zip(tubs, lids, strict=True)))
+    check(soup, close_mesh(soup))
+
+
 def test_double_sided_sheets_become_thin_solids():
     rng = np.random.default_rng(0)
     sheet = trimesh.creation.box((1.0, 0.0, 0.6)).subdivide_to_size(0.1)

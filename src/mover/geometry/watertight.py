@@ -70,6 +70,7 @@ def _field(
     shell = ~air & (distance <= wall)
     field[shell] = distance[shell]
     winding = _windings(verts, faces, start, cell, distance < SHELL * cell, air)
+    winding = np.pad(winding[1:-1, 1:-1, 1:-1], 1)  # the border of the grid is air in any case
     lid = wall + (INSIDE - winding) * LID * cell
     return np.where(air, np.minimum(field, lid), field)
 
@@ -109,7 +110,7 @@ def _bodies(points: np.ndarray, shell: np.ndarray) -> Triangles:
         shell, volume = shell[:, ::-1].copy(), -volume
     shell = shell[(volume > SPECK * volume.max())[part_of]]
     closed = manifold(points, shell)
-    assert closed is not None  # the border of the grid is air
+    assert closed is not None  # as the border of the grid is air
     return closed
 
 
