@@ -153,6 +153,13 @@ def test_check_draws_a_picture_and_lists_every_object(folder, capsys):
     for item in json.loads((folder / "scene.json").read_text())["objects"]:
         assert item["id"] in out
     assert (folder.parent / "check.png").stat().st_size > 1000
+    scene = json.loads((folder / "scene.json").read_text())
+    mesh = folder / Path(scene["objects"][0]["mesh"]).with_suffix(".obj")
+    mesh.write_text("mtllib no.mtl\nusemtl oak\nv 0 0 0\nv 1 0 0\nv 0 1 1\nf 1 2 3\n")
+    scene["objects"][0]["mesh"] = f"meshes/{mesh.name}"
+    (folder / "scene.json").write_text(json.dumps(scene))
+    assert check(folder) == 0
+    assert f"warning: {mesh.name} loses the materials of no.mtl" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("name", ["c3", "c3.gif"])

@@ -139,6 +139,7 @@ BAD = {
     "lines.obj": ("v 0 0 0\nv 1 0 0\nl 1 2\n", "without faces"),
     "pointer.glb": ("version https://git-lfs.github.com/spec/v1\noid sha256:1\n", "Git LFS"),
     "page.stl": ("<!DOCTYPE html>\n<html><body>sign in</body></html>", "a web page"),
+    "wide.obj": ("\ufeffv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "text in UTF-16: save it as UTF-8"),
     "page.obj": ("<html><body>sign in</body></html>", "a web page"),
 }
 
@@ -146,7 +147,8 @@ BAD = {
 @pytest.mark.parametrize("name", BAD)
 def test_what_is_no_mesh_is_named_for_what_it_is(name, tmp_path):
     content, words = BAD[name]
-    (tmp_path / name).write_text(content)
+    text = "utf-16-le" if name == "wide.obj" else "utf-8"
+    (tmp_path / name).write_text(content, text)
     with pytest.raises(InputError, match=words) as caught:
         load_arrays(At(name, "scene.json", "objects[0].mesh"), tmp_path / name)
     assert str(caught.value).startswith("scene.json: field 'objects[0].mesh' has ")

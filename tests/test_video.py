@@ -154,6 +154,9 @@ class TestNetworks:
         assert lines[0] == "mover video: not on this machine:"
         assert sum("hf download" in line for line in lines[1:]) == 2
         assert not (tmp_path / "out" / "capture").exists()
+        (tmp_path / "a.json").write_text("{}")
+        assert run_command("video", [str(tmp_path / "a.json"), "--out", str(tmp_path)]) == 2
+        assert "a.json: is no video, expected one" in capsys.readouterr().err
 
     @pytest.mark.skipif(find_spec("transformers") is None, reason="transformers is not installed")
     def test_a_folder_without_weights_is_missing_and_one_with_them_is_not(self, tmp_path: Path):

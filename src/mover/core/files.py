@@ -18,6 +18,7 @@ INSTEAD = {
     rb"\s*<(!doctype )?html": "it is a web page in place of the file: download the file itself",
     rb"(?s).{4}ftyp(hei|mif|avif)": "it is a picture of a phone (HEIC): save it as JPEG or PNG",
     rb"(?s).{4}ftyp|\x1aE\xdf\xa3": "it is a video: save one of its frames as JPEG or PNG",
+    rb"\xff\xfe|\xfe\xff": "it is text in UTF-16: save it as UTF-8",
     rb"\Z": "it is empty: copy or download it again",
 }
 """What a file may be instead of what was expected, by its first bytes."""

@@ -52,6 +52,7 @@ def check(arguments: Sequence[str]) -> None:
     from mover.app.pictures.overlay import save_overlay
     from mover.io.capture.evidence import evidence_table, gather_evidence
     from mover.io.capture.faults import check_against_picture, write_mended
+    from mover.io.export.scene_glb import losses_of
     from mover.pipeline.result import warnings_of
 
     capture = read(args.source)
@@ -59,7 +60,7 @@ def check(arguments: Sequence[str]) -> None:
     say(evidence_table(capture, gather_evidence(capture)))
     save_overlay(capture, args.out)
     findings = check_against_picture(capture)
-    for warning in dict.fromkeys((*findings.warnings, *warnings)):
+    for warning in dict.fromkeys((*findings.warnings, *warnings, *losses_of(capture.scene))):
         say(f"warning: {warning}")
     if findings.faults and args.mend is None:
         say(f"a capture without that: mover check {args.source} --mend NEW")

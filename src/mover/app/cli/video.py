@@ -199,6 +199,8 @@ def video_to_room(
     source, config = args.source, config or PerceiveConfig()
     if not source.exists():
         raise InputError(f"{source}: there is no such file, expected a video or a folder")
+    if source.suffix.lower() in (".json", ".npz", ".pkl", ".txt"):
+        raise InputError(f"{source}: is no video, expected one, or a folder of its pictures")
     flags.preset_named(args.preset, PRESETS)
     chain.BodiesFrom(args.bodies, args.bodies_tool).check()
     if finders is None:
