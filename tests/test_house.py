@@ -17,7 +17,7 @@ HOME = Path(__file__).parents[1]
 LINES = {
     "src/mover/app": 4_294,
     "src/mover/bodies": 2_041,
-    "src/mover/core": 1_607,
+    "src/mover/core": 1_570,
     "src/mover/energy": 3_818,
     "src/mover/evaluate": 1_027,
     "src/mover/extensions": 1_235,
@@ -37,7 +37,7 @@ LIMITS = {
     "words in code": 0,
     "words in pages": 0,
     "class names with two meanings": 0,
-    "small helpers": 65,
+    "small helpers": 63,
     "modules in circles": 0,
 }  # fmt: skip
 WORDS = {
