@@ -275,35 +275,25 @@ def _tensor(call: Call) -> torch.Tensor:
         raise ValueError("a tensor that is larger than what it holds") from error
 
 
-def _bytes(call: Call) -> bytes:
-    """Bytes from text or bytes, never from a size."""
-    match call.args:
-        case []:
-            return b""
-        case [bytes() as raw]:
-            return raw
-        case [str() as text] | [str() as text, "latin1" | "latin-1"]:
+def _python(call: Call) -> Any:  # noqa: ANN401
+    """Containers, bytes, complex numbers and paths; none from a size."""
+    match call.name.rpartition(".")[2], call.args:
+        case "set" | "frozenset" | "list" | "tuple" | "Size", [] | [list()]:
+            return call.args[0] if call.args else []
+        case "dict" | "OrderedDict", [] | [list()]:
+            return {str(key): value for key, value in dict(*call.args).items()} | call.items
+        case "defaultdict", _:
+            return call.items  # without the maker of defaults
+        case "bytes" | "bytearray", [] | [bytes()]:
+            return b"".join(call.args)
+        case "bytes" | "bytearray" | "encode", [str() as text, "latin1" | "latin-1"]:
             return text.encode("latin1")
+        case "complex", [float() as real, float() as imaginary]:
+            return complex(real, imaginary)
+        case "PosixPath" | "PurePosixPath" | "WindowsPath" | "PureWindowsPath", parts:
+            return "/".join(parts).replace("//", "/")
         case _:
-            raise ValueError("bytes from something else than text")
-
-
-def _list(call: Call) -> list[Any]:
-    """The items of another container."""
-    (items,) = call.args or [[]]
-    if not isinstance(items, list):
-        raise ValueError("a container of something else than a list")
-    return items
-
-
-def _mapping(call: Call) -> dict[str, Any]:
-    """Of pairs, and of the items that follow."""
-    return {str(key): value for key, value in dict(*call.args).items()} | call.items
-
-
-def _path(call: Call) -> str:
-    """Of the parts of a path."""
-    return "/".join(call.args).replace("//", "/")
+            raise ValueError(f"{call.name} of something else than text, lists or numbers")
 
 
 def _dtype(call: Call) -> np.dtype[Any]:
@@ -366,14 +356,12 @@ WORDS = {
 }  # fmt: skip
 """What a pickle may name, but not call; but for copyreg's two, see `Word`."""
 MADE: Mapping[str, Callable[[Call], Any]] = {
-    "builtins.set": _list, "builtins.frozenset": _list, "builtins.list": _list,
-    "builtins.tuple": _list, "torch.Size": _list,
-    "builtins.dict": _mapping, "collections.OrderedDict": _mapping,
-    "collections.defaultdict": lambda call: call.items,  # without the maker of defaults
-    "builtins.bytes": _bytes, "builtins.bytearray": _bytes, "_codecs.encode": _bytes,
-    "builtins.complex": lambda call: complex(*call.args),
-    "pathlib.PosixPath": _path, "pathlib.PurePosixPath": _path,
-    "pathlib.WindowsPath": _path, "pathlib.PureWindowsPath": _path,
+    **dict.fromkeys((
+        *(f"builtins.{kind}" for kind in ("set", "frozenset", "list", "tuple", "dict", "bytes",
+                                          "bytearray", "complex")),
+        *(f"pathlib.{kind}Path" for kind in ("Posix", "PurePosix", "Windows", "PureWindows")),
+        "collections.OrderedDict", "collections.defaultdict", "_codecs.encode", "torch.Size",
+    ), _python),
     "numpy.dtype": _dtype,
     "numpy._reconstruct": lambda call: _filled(*call.state[-4:]),
     "numpy._frombuffer": lambda call: _filled(*(call.args[part] for part in (2, 1, 3, 0))),
