@@ -15,16 +15,16 @@ import pytest
 
 HOME = Path(__file__).parents[1]
 LINES = {
-    "src/mover/app": 4_294,
-    "src/mover/bodies": 2_041,
-    "src/mover/core": 1_607,
+    "src/mover/app": 4_283,
+    "src/mover/bodies": 2_017,
+    "src/mover/core": 1_558,
     "src/mover/energy": 3_818,
     "src/mover/evaluate": 1_027,
     "src/mover/extensions": 1_235,
     "src/mover/fitting": 2_097,
     "src/mover/furniture": 955,
     "src/mover/geometry": 3_529,
-    "src/mover/io": 10_615,
+    "src/mover/io": 10_608,
     "src/mover/perceive": 2_865,
     "src/mover/pipeline": 1_225,
     "src/mover/stages": 6_134,
@@ -37,7 +37,7 @@ LIMITS = {
     "words in code": 0,
     "words in pages": 0,
     "class names with two meanings": 0,
-    "small helpers": 65,
+    "small helpers": 63,
     "modules in circles": 0,
 }  # fmt: skip
 WORDS = {

@@ -13,8 +13,8 @@ import signal
 import subprocess
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib import import_module
@@ -122,10 +122,8 @@ def earlier(job: BatchJob, retry: bool = False) -> Outcome | None:
     if found.get("fingerprint") != job.fingerprint:
         return None
     seconds, reason = float(found.get("seconds", 0.0)), str(found.get("reason", ""))
-    if reason:
-        return None if retry else Outcome(job.name, "failed", seconds, reason)
-    whole = all((out / name).is_file() for name in PRODUCTS)
-    return Outcome(job.name, "kept", seconds) if whole else None
+    stands = not retry if reason else all((out / name).is_file() for name in PRODUCTS)
+    return Outcome(job.name, "failed" if reason else "kept", seconds, reason) if stands else None
 
 
 def run_job(job: BatchJob) -> Outcome:
@@ -134,13 +132,10 @@ def run_job(job: BatchJob) -> Outcome:
     The lock is passed on to its process: one that outlives a killed batch is waited for.
     """
     out = Path(job.out)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        with (out / ".lock").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)  # another batch may run this capture
-            return earlier(job, retry=True) or _run(job, out, lock.fileno())
-    except Exception as error:  # a full disk, a forbidden folder: it must not end the others
-        return lost(job, error)
+    out.mkdir(parents=True, exist_ok=True)
+    with (out / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # another batch may run this capture
+        return earlier(job, retry=True) or _run(job, out, lock.fileno())
 
 
 def _run(job: BatchJob, out: Path, lock: int) -> Outcome:
@@ -159,15 +154,11 @@ def _run(job: BatchJob, out: Path, lock: int) -> Outcome:
         return ended(job, job.limit, f"ran longer than its limit of {job.limit:g} s")
     if code in INTERRUPTED:
         return Outcome(job.name, "stopped")
-    seconds, why = time.monotonic() - start, f"exit code {code}"
-    missing = [name for name in PRODUCTS if not (out / name).is_file()]
-    if code == 0 and not missing:
-        return ended(job, seconds)
-    if code == 0:
-        why = f"ended well without {' and '.join(missing)}"
-    elif code < 0:
+    missing = " and ".join(name for name in PRODUCTS if not (out / name).is_file())
+    why = f"exit code {code}" if code else missing and f"ended well without {missing}"
+    if code < 0:
         why = f"ended by signal {-code} ({signal.strsignal(-code)})"
-    return ended(job, seconds, f"{why}: {last_line(out / LOG)}")
+    return ended(job, time.monotonic() - start, why and f"{why}: {last_line(out / LOG)}")
 
 
 def last_line(log: Path) -> str:
@@ -184,12 +175,6 @@ def ended(job: BatchJob, seconds: float, reason: str = "") -> Outcome:
     return Outcome(job.name, "failed" if reason else "done", seconds, reason)
 
 
-def lost(job: BatchJob, error: Exception) -> Outcome:
-    """Record a job whose worker vanished, so that it could not do so itself."""
-    text = " ".join(f"{type(error).__name__}: {error}".split())[:300]
-    return earlier(job) or ended(job, 0.0, f"its worker was lost: {text}")
-
-
 def read_tree(path: Path) -> dict[str, Any]:
     """A JSON object, empty where there is none or it was cut short."""
     try:
@@ -203,10 +188,20 @@ def on_this_machine(jobs: Sequence[BatchJob], workers: int) -> Iterator[Outcome]
     """So many processes at a time; Ctrl-C reaches them, and no further one is started."""
     pool = ThreadPoolExecutor(workers)
     try:
-        for future in as_completed([pool.submit(run_job, job) for job in jobs]):
-            yield future.result()
+        yield from _outcomes({pool.submit(run_job, job): job for job in jobs})
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def _outcomes(running: Mapping[Future[Outcome], BatchJob]) -> Iterator[Outcome]:
+    """How jobs ended; a full disk, a forbidden folder, a lost machine end none but their own."""
+    for future in as_completed(running):
+        job = running[future]
+        try:
+            yield future.result()
+        except Exception as error:
+            text = " ".join(f"{type(error).__name__}: {error}".split())[:300]
+            yield earlier(job) or ended(job, 0.0, f"its worker was lost: {text}")
 
 
 def on_ray(jobs: Sequence[BatchJob], workers: int, share: RayOptions) -> Iterator[Outcome]:
@@ -226,15 +221,8 @@ def on_ray(jobs: Sequence[BatchJob], workers: int, share: RayOptions) -> Iterato
         options |= {"num_cpus": max(1, round(workers * share.cpus)), "include_dashboard": False}
     ray.init(address=share.address, ignore_reinit_error=True, **options)
     task = ray.remote(num_cpus=share.cpus, num_gpus=share.gpus, max_retries=2)(run_job)
-    waiting = {task.remote(job): job for job in jobs}
     try:
-        while waiting:
-            handle = ray.wait(list(waiting))[0][0]
-            job = waiting.pop(handle)
-            try:
-                yield ray.get(handle)
-            except ray.exceptions.RayError as error:
-                yield lost(job, error)
+        yield from _outcomes({task.remote(job).future(): job for job in jobs})
     finally:
         ray.shutdown()
 
@@ -276,11 +264,12 @@ def run_batch(
 
 def _row(job: BatchJob, outcome: Outcome | None) -> dict[str, Any]:
     """A line of the summary."""
+    row: dict[str, Any] = {"name": job.name, "state": "open", "capture": job.capture}
     if outcome is None or outcome.state == "stopped":
-        return {"name": job.name, "state": "open", "capture": job.capture}
-    row = {"name": job.name, "seconds": round(outcome.seconds, 2), "capture": job.capture}
+        return row
+    row |= {"state": "failed", "seconds": round(outcome.seconds, 2), "reason": outcome.reason}
     if outcome.state == "failed":
-        return {**row, "state": "failed", "reason": outcome.reason}
+        return row
     log = read_tree(Path(job.out) / "run.json")
     peak = max((stage.get("peak_memory", 0.0) for stage in log.get("stages", [])), default="")
     warned = len(log["warnings"]) if "warnings" in log else ""

@@ -132,7 +132,7 @@ def _of_open_body(bodies: Bodies) -> Int[Tensor, " verts"]:
         odd = at["betas"].square().sum() / SIGMA_SHAPE**2
         return miss.square().sum() / SIGMA_JOINT**2 + bent + odd
 
-    at = solved(start, tuple(start), energy, STEPS)
+    at = solved(start, energy, STEPS)
     with torch.no_grad():
         posed = model.posed(replace(straight, **at))[0][0]
     mesh = bodies.verts[0].detach().cpu().float()

@@ -11,6 +11,7 @@ bodies are turned by the true direction of gravity; upstream trusts the camera t
 
 import hashlib
 import logging
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -50,38 +51,30 @@ def neighbours(faces: Int[np.ndarray, "faces 3"], count: int) -> tuple[list[list
     for a, b, c in faces.tolist():
         corners, sides = [(c, a, b), (a, b, c), (b, c, a)], {(a, b), (b, c), (c, a)}
         joined = [_joined(fans[v], into, out) for into, v, out in corners]
-        rings = [ring for ring in joined if ring is not None]
-        if len(rings) < 3 or inner & {a, b, c} or taken & sides:
+        if not all(joined) or inner & {a, b, c} or taken & sides:
             left_out += 1
             continue
         taken |= sides
-        for (_, v, _), ring in zip(corners, rings, strict=True):
+        for (_, v, _), ring in zip(corners, joined, strict=True):
             if ring is fans[v]:
                 inner.add(v)
             fans[v] = ring
     return [[n for fan in each for n in fan] for each in fans], left_out
 
 
-def _joined(fans: list[list[int]], into: int, out: int) -> list[list[int]] | None:
-    """The fans with one more triangle; the same where the last gap closes, None if it is odd."""
-    ends = [fan for fan in fans if fan[-1] == into]
-    starts = [fan for fan in fans if fan[0] == out]
-    if not ends and not starts:
-        return [*fans, [into, out]]
-    at = fans.index((ends or starts)[0])
-    others = [*fans[at + 1 :], *fans[:at]]
-    if not ends:
-        return [[into, *starts[0]], *others]
-    if not starts:
-        return [*others, [*ends[0], out]]
-    if ends[0] is starts[0]:
-        return None if others else fans
-    others.remove(starts[0])  # it moves to where the first one ends
-    if fans[0] is starts[0]:
-        return [*others, [*ends[0], *starts[0]]]
-    ring = [[*ends[0], *starts[0]], *others]
-    turn = 0 if fans[0] is ends[0] else ring.index(fans[0])
-    return [*ring[turn:], *ring[:turn]]
+def _joined(fans: list[list[int]], into: int, out: int) -> list[list[int]]:
+    """The fans with one more triangle; the same where the last gap closes, none if it is odd."""
+    end = next((fan for fan in fans if fan[-1] == into), None)
+    start = next((fan for fan in fans if fan[0] == out), None)
+    wider = [*(end or [into]), *(start or [out])]
+    if end is start:
+        return [*fans, wider] if end is None else fans if len(fans) == 1 else []
+    at = next(k for k, fan in enumerate(fans) if fan is (end or start))
+    others = [fan for fan in (*fans[at + 1 :], *fans[:at]) if fan is not start]
+    if end is None or (start and fans[0] is end):
+        return [wider, *others]
+    turn = others.index(fans[0]) if start and fans[0] is not start else 0
+    return [*others[turn:], wider, *others[:turn]]
 
 
 def spirals(
@@ -116,10 +109,10 @@ def spirals(
 def _read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and triangles in the order of the file; nothing is merged."""
     try:
-        rows = [line.split() for line in path.read_text().splitlines()]
-        verts = [[float(w) for w in row[1:4]] for row in rows if row[:1] == ["v"]]
-        faces = [[int(w.split("/")[0]) - 1 for w in row[1:4]] for row in rows if row[:1] == ["f"]]
-        return np.asarray(verts).reshape(-1, 3), np.asarray(faces, dtype=np.int64).reshape(-1, 3)
+        text = path.read_text()
+        verts = re.findall(r"^v[ \t]+(\S+)[ \t]+(\S+)[ \t]+(\S+)", text, re.M)
+        faces = re.findall(r"^f[ \t]+(\d+)\S*[ \t]+(\d+)\S*[ \t]+(\d+)", text, re.M)
+        return np.asarray(verts, dtype=float), np.asarray(faces, dtype=np.int64) - 1
     except BROKEN as error:
         raise InputError(f"{path}: cannot be read as a mesh ({error})") from error
 
@@ -134,8 +127,8 @@ def _sparse(path: Path, shape: tuple[int, int]) -> Tensor:
         raise InputError(f"{path}: cannot be read as a sparse matrix ({error})") from error
     if matrix.shape != shape:
         raise InputError(f"{path.name}: has the shape {matrix.shape}, expected {shape}")
-    index = torch.from_numpy(np.stack([matrix.row, matrix.col]).astype(np.int64))
-    values = torch.from_numpy(np.asarray(matrix.data, dtype=np.float32))
+    index = torch.from_numpy(np.stack([matrix.row, matrix.col]))
+    values = torch.from_numpy(matrix.data.astype(np.float32))
     return torch.sparse_coo_tensor(index, values, shape, check_invariants=True).coalesce()
 
 
@@ -190,6 +183,7 @@ def load_posa(weights: Path, meshes: Path) -> Posa:
     return Posa(decoder, torch.from_numpy(index), (d1, d2), (u2, u1), channels)
 
 
+@torch.no_grad()
 def posa_contacts(
     posa: Posa, bodies: Bodies, samples: int = 0, seed: int = 0
 ) -> Float[Tensor, "bodies verts"]:
@@ -214,8 +208,7 @@ def posa_contacts(
     chances: list[Tensor] = []
     for part in still.float().split(CHUNK):
         coarse = _through(posa.down, part)
-        with torch.no_grad():
-            chance = torch.stack([decode(posa, coarse, z)[..., :1] for z in codes]).mean(0)
+        chance = torch.stack([decode(posa, coarse, z)[..., :1] for z in codes]).mean(0)
         chances.append(_through(posa.up, chance)[..., 0].clamp(0, 1))
     return torch.cat(chances)
 

@@ -9,7 +9,7 @@ angles of SMPL, whose 21 joints of the body SMPL-X has, too.
 """
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mover.bodies.skinning import FLAT, SkinnedBody, vertex_subset
+from mover.bodies.skinning import FLAT, HAND_POSES, SkinnedBody, vertex_subset
 from mover.bodies.smpl_files import FOLDER, KINDS
 from mover.core.errors import InputError
 from mover.core.pickles import load_plain
@@ -46,10 +46,9 @@ class TransferMatrix:
 
 def find_matrix() -> Path | None:
     """The user's official file in the folder of `MOVER_BODY_MODELS` or its `transfer_data`."""
-    given = os.environ.get(FOLDER)
-    places = ("", "transfer_data", "transfer") if given else ()
-    tried = (Path(given or "") / place / FILE for place in places)
-    return next((path for path in tried if path.is_file()), None)
+    home, places = os.environ.get(FOLDER), ("", "transfer_data", "transfer")
+    tried = [Path(home, place, FILE) for place in places] if home else []
+    return next(filter(Path.is_file, tried), None)
 
 
 def read_matrix(path: Path) -> TransferMatrix:
@@ -64,24 +63,21 @@ def read_matrix(path: Path) -> TransferMatrix:
     from scipy import sparse
 
     found: Any = load_plain(path)
-    keys = list(found) if isinstance(found, dict) else []
+    keys = list(found) if isinstance(found, dict) and found else [type(found).__name__]
     key = next((k for k in ("mtx", "matrix") if k in keys), None)
     if key is None:
-        named = ", ".join(map(str, keys)) or type(found).__name__
+        named = ", ".join(keys)
         raise InputError(f"{path.name}: field 'mtx' or 'matrix' is missing; found {named}")
     rows, columns = KINDS["smplx"].verts, KINDS["smpl"].verts
-    shape = tuple(np.shape(found[key]))
-    if shape not in ((rows, columns), (rows, 2 * columns)):
-        raise InputError(
-            f"{path.name}: field '{key}' has shape {shape}, expected ({rows}, {columns}) or "
-            f"({rows}, {2 * columns})"
-        )
+    shape, one, two = np.shape(found[key]), (rows, columns), (rows, 2 * columns)
+    if shape not in (one, two):
+        raise InputError(f"{path.name}: field '{key}' has shape {shape}, expected {one} or {two}")
     matrix: Any = sparse.csr_matrix(found[key])[:, :columns]
     if not np.isfinite(matrix.data).all():
         raise InputError(f"{path.name}: field '{key}' has numbers that are not finite")
     target = _valid(path.with_name("smplx_mask_ids.npy"), rows)
-    if len(target) > SAMPLED:
-        target = target[torch.linspace(0, len(target) - 1, SAMPLED).round().long()]
+    count = len(target)
+    target = target[torch.linspace(0, count - 1, min(count, SAMPLED)).round().long()]
     some: Any = matrix[target.numpy()]
     source = np.unique(some.indices)
     mix = torch.from_numpy(some[:, source].toarray().astype(np.float32))
@@ -90,16 +86,13 @@ def read_matrix(path: Path) -> TransferMatrix:
 
 def _valid(path: Path, rows: int) -> Int[Tensor, " valid"]:
     """The vertices that count, all where nothing is said."""
-    if not path.is_file():
-        return torch.arange(rows)
     try:
-        ids = np.load(path, allow_pickle=False)
+        ids = np.load(path, allow_pickle=False) if path.is_file() else np.arange(rows)
     except BROKEN as error:
         raise InputError(f"{path.name}: cannot be read, expected an .npy file") from error
     if ids.ndim != 1 or ids.dtype.kind not in "iu" or not len(ids) or ids.max() >= rows:
-        raise InputError(
-            f"{path.name}: has {ids.shape} of {ids.dtype}, expected vertices of SMPL-X"
-        )
+        kind = f"{ids.shape} of {ids.dtype}"
+        raise InputError(f"{path.name}: has {kind}, expected vertices of SMPL-X")
     return torch.from_numpy(np.unique(ids.astype(np.int64)))
 
 
@@ -110,60 +103,50 @@ def as_smplx(
     with torch.no_grad():
         verts, _ = vertex_subset(smpl, matrix.source).posed(pose)
     goal = torch.einsum("kv,bvi->bki", matrix.mix.to(verts), verts)
-    small, rows = vertex_subset(smplx, matrix.target), len(goal)
+    small = vertex_subset(smplx, matrix.target)
     shapes, person = torch.unique(pose.betas, dim=0, return_inverse=True)
     angles = torch.cat([pose.global_orient, pose.body_pose[:, :ANGLES]], -1)
-    hands = {f"{side}_hand_pose": goal.new_zeros(rows, 45) for side in ("left", "right")}
+    straight = {name: goal.new_zeros(len(goal), 45) for name in HAND_POSES}
+    straight[FLAT] = goal.new_ones(len(goal), 1)
 
     def laid(at: dict[str, Tensor]) -> BodyPose:
-        turned = angles + at["turn"]
         return BodyPose(
             model="smplx", gender=smplx.gender, betas=at["betas"][person],
-            global_orient=turned[:, :3], body_pose=turned[:, 3:], transl=at["transl"],
-            extra=hands | {FLAT: goal.new_ones(rows, 1)},
+            transl=at["transl"],
+            global_orient=at["angles"][:, :3], body_pose=at["angles"][:, 3:], extra=straight,
         )  # fmt: skip
 
     def energy(at: dict[str, Tensor]) -> Float[Tensor, ""]:
         miss = (small.posed(laid(at))[0] - goal).square().sum(-1).mean(1).sum()
-        turn = at["turn"].square().mean(-1).sum() / SIGMA_POSE**2
+        turn = (at["angles"] - angles).square().mean(-1).sum() / SIGMA_POSE**2
         return miss / SIGMA_VERTEX**2 + turn + at["betas"].square().sum() / SIGMA_SHAPE**2
 
-    at = {"betas": goal.new_zeros(len(shapes), SHAPES), "transl": goal.new_zeros(rows, 3)}
-    at["turn"] = torch.zeros_like(angles)
-    with torch.no_grad():
-        at["transl"] = (goal - small.posed(laid(at))[0]).mean(1)
-    at = solved(at, ("betas", "transl"), energy, STEPS)
-    return laid(solved(at, ("betas", "transl", "turn"), energy, STEPS))
+    at = {"betas": goal.new_zeros(len(shapes), SHAPES), "transl": pose.transl}
+    at = solved(at, lambda some: energy(some | {"angles": angles}), STEPS)
+    return laid(solved(at | {"angles": angles}, energy, STEPS))
 
 
 def solved(
-    start: dict[str, Tensor],
-    free: Iterable[str],
-    energy: Callable[[dict[str, Tensor]], Float[Tensor, ""]],
-    steps: int,
-    evaluations: int | None = None,
-    flat: float = 1e-7,
+    start: dict[str, Tensor], energy: Callable[[dict[str, Tensor]], Float[Tensor, ""]], steps: int
 ) -> dict[str, Tensor]:
-    """Lower the energy in some of the unknowns by L-BFGS with a strong Wolfe line search.
-
-    It ends after `evaluations` (None: 1.25 for each step) or where no gradient exceeds `flat`.
+    """Lower the energy by at most so many steps of L-BFGS with a strong Wolfe line search.
 
     Raises:
         ValueError: If the energy is not finite at the start.
     """
-    values = {name: start[name].detach().clone().requires_grad_() for name in free}
+    values = {name: value.detach().clone().requires_grad_() for name, value in start.items()}
     solver = torch.optim.LBFGS(
-        list(values.values()), max_iter=steps, max_eval=evaluations, history_size=20,
-        tolerance_grad=flat, line_search_fn="strong_wolfe",
+        list(values.values()), max_iter=steps, max_eval=2 * steps, history_size=20,
+        tolerance_grad=1e-6, line_search_fn="strong_wolfe",
     )  # fmt: skip
 
     def closure() -> Tensor:
         solver.zero_grad()
-        value = energy(start | values)
+        value = energy(values)
         torch.autograd.backward(value)
         return value
 
     first = solver.step(closure)  # pyright: ignore[reportArgumentType]
     if not bool(torch.as_tensor(first).isfinite()):
         raise ValueError("the energy of the bodies is not finite")
-    return start | {name: value.detach() for name, value in values.items()}
+    return {name: value.detach() for name, value in values.items()}

@@ -1,8 +1,8 @@
 """Pickles of other programs, read as data by an allow list of names: nothing in them ever runs.
 
-Python's own unpickler reads the opcodes; those that import, call or set are refused. What a file
-names is a word (`Word`), and what it would call is kept as data (`Call`). Only then is each call of
-the list worked out, by functions of this module. Torch files are read by torch's reader of weights.
+Python's own unpickler reads the opcodes, but those that import, call or set. What a file names is a
+word (`Word`), and what it would call is kept as data (`Call`). Only then is each call of the list
+worked out, by functions of this module. Torch files are read by torch's reader of weights.
 """
 
 import bz2
@@ -21,51 +21,35 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from numpy.lib import format as npy
 
 from mover.core.errors import InputError
 from mover.core.files import unreadable
 from mover.core.records import BROKEN
 
-LARGEST = 2 << 30
-"""No file and no array is larger, and no tree that a file unfolds to [bytes]."""
-REPEATED = 1 << 26
-"""No tensor that repeats its numbers is larger [bytes]."""
-DEEPEST = 64
-"""Levels of lists and mappings."""
+LARGEST = 2 << 30  # of a file, of an array, of the tree that a file unfolds to [bytes]
+REPEATED = 1 << 26  # of a tensor that repeats its numbers [bytes]
+DEEPEST = 64  # levels of lists and mappings
 ITEM = 64  # what Python takes for an item of a list, nearly [bytes]
-TORCH = 0x1950A86A20F9469CFC6C
-"""The number that old torch files start with."""
-PLAIN = "expected arrays, numbers, text and containers"
+TORCH = 0x1950A86A20F9469CFC6C  # the number that old torch files start with
 READ: dict[int, Any] = pickle._Unpickler.dispatch  # pyright: ignore[reportPrivateUsage]
-REFUSED = (
+REFUSED = b"".join((
     pickle.INST, pickle.OBJ, pickle.EXT1, pickle.EXT2, pickle.EXT4, pickle.PERSID,
     pickle.BINPERSID, pickle.NEWOBJ_EX, pickle.NEXT_BUFFER, pickle.READONLY_BUFFER,
-)  # fmt: skip
+))  # fmt: skip
 """Opcodes that would make more than data."""
 BROKEN_PICKLE = (
     *BROKEN, OverflowError, AssertionError, struct.error, lzma.LZMAError, pickle.UnpicklingError,
 )  # fmt: skip
-PACKED: Mapping[tuple[bytes, ...], Callable[[], Any]] = {
-    (b"\x1f\x8b", b"\x78\x01", b"\x78\x5e", b"\x78\x9c", b"\x78\xda"): (
-        lambda: zlib.decompressobj(wbits=47)
-    ),
-    (b"BZh",): bz2.BZ2Decompressor,
-    (b"\xfd7zXZ\x00", b"\x5d\x00"): lzma.LZMADecompressor,
+PACKED: Mapping[bytes, Callable[[], Any]] = {
+    b"\x1f\x8b": lambda: zlib.decompressobj(wbits=31),
+    b"\x78": zlib.decompressobj,
+    b"BZh": bz2.BZ2Decompressor,
+    b"\xfd7zXZ\x00": lzma.LZMADecompressor,
+    b"\x5d\x00": lzma.LZMADecompressor,
 }
-"""How files with these first bytes are unpacked: gzip and zlib, bzip2, xz and lzma."""
-TYPES = re.compile(r"[<>=|]?(\?|[biufcSU]\d{1,7}|[bBhHiIlLqQefdFDgG]|O8?|object)")
+"""How files with these first bytes are unpacked."""
+TYPES = re.compile(r"[<>=|]?(\?|[biufcSU][1-9]\d{0,6}|[bBhHiIlLqQefdFDgG]|O8?|object)")
 """Names of types of numbers, of text and of objects; no fields."""
-SETS = ("builtins.set", "builtins.frozenset")
-SIMPLE = (int, float, complex, str, bytes, type(None))
-RENAMED = {
-    "__builtin__": "builtins", "copy_reg": "copyreg", "pathlib._local": "pathlib",
-    "numpy._core.multiarray": "numpy.core.multiarray",
-    "numpy._core.numeric": "numpy.core.numeric",
-    **{f"scipy.sparse.{dash}{form}": "scipy.sparse" for dash in ("", "_")
-       for form in ("csc", "csr", "coo")},
-}  # fmt: skip
-"""Modules that are the same as others: of Python 2, of other versions."""
 
 
 def load_plain(path: Path) -> Any:  # noqa: ANN401
@@ -96,25 +80,22 @@ def load_plain(path: Path) -> Any:  # noqa: ANN401
 
 def _loaded(data: bytes) -> Any:  # noqa: ANN401
     """The content of a file in any of the forms, with calls as data."""
-    for heads, packed in PACKED.items():
-        if data.startswith(heads):
-            unpacker = packed()
-            data = unpacker.decompress(data, LARGEST + 1)
-            if len(data) > LARGEST:
-                raise InputError(f"unpacks to more than {LARGEST} bytes, expected at most that")
-            if not unpacker.eof:
-                raise ValueError("it ends too early")
-            break
+    packed = next((head for head in PACKED if data.startswith(head)), None)
+    if packed:
+        unpacker = PACKED[packed]()
+        data = unpacker.decompress(data, LARGEST + 1)
+        if len(data) > LARGEST:
+            raise InputError(f"unpacks to more than {LARGEST} bytes, expected at most that")
+        if not unpacker.eof:
+            raise ValueError("it ends too early")
     if data[:4] == b"PK\x03\x04":
         return _of_archive(data)
-    stream = BytesIO(data)
     if data[:6] == b"\x93NUMPY":
-        version = npy.read_magic(stream)
-        read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-        if read(stream)[2] != np.dtype("O"):
+        header, _, data = data.partition(b"\n")
+        if b"'|O'" not in header:
             raise ValueError("an .npy file of plain numbers, which is no pickle")
-    value = Reader(stream).load()
-    return _of_torch(data) if type(value) is int and value == TORCH else value
+    value = Reader(BytesIO(data)).load()
+    return _of_torch(data) if value == TORCH else value
 
 
 def _of_archive(data: bytes) -> Any:  # noqa: ANN401
@@ -150,7 +131,7 @@ class Row(tuple[Any, ...]):
     __slots__ = ()
 
     def __hash__(self) -> int:
-        if not all(isinstance(v, SIMPLE) for v in self):
+        if not all(isinstance(v, int | float | complex | str | bytes | None) for v in self):
             raise ValueError("a key that is no text, number or tuple of these")
         return super().__hash__()
 
@@ -158,38 +139,31 @@ class Row(tuple[Any, ...]):
 class Call:
     """What a pickle would call, as data: name, arguments, and the state and items that follow."""
 
-    __slots__ = ("args", "items", "name", "state")
-
-    def __init__(self, name: Any, args: tuple[Any, ...]) -> None:  # noqa: ANN401
+    def __init__(self, name: Any, args: Any, state: Any = None, items: Any = None) -> None:  # noqa: ANN401
         if not isinstance(name, Word):
             raise ValueError("a call of something that has no name")
-        self.name, self.args, self.state = name, args, None
-        self.items: dict[Any, Any] = {}
+        self.name, self.args, self.state, self.items = name, args, state, items or {}
 
     def __setitem__(self, key: object, value: object) -> None:
         self.items[key] = value
 
-    def __setstate__(self, state: Any) -> None:  # noqa: ANN401
-        self.state = state
-
 
 class Word(str):
-    """A class or function that a pickle names: a word, not the thing."""
+    """A class or function that a pickle names, by its package: a word, not the thing."""
 
     __slots__ = ()
 
     def __call__(self, *args: Any) -> Call | set[Any]:  # noqa: ANN401
         """The call as data; of what is made for an object of a class, that of the class."""
-        if self in SETS and all(isinstance(items, list | tuple) for items in args):
-            return set(*args)  # items are hashed at once, as those of other sets
-        if self == "copyreg.__newobj__":
-            return Call(args[0], args[1:])
-        if self != "copyreg._reconstructor":
-            return Call(self, args)
-        kind, base, state = args
-        if not isinstance(base, Word) or not base.endswith(".object") or state is not None:
-            raise ValueError("an object of another class's")
-        return Call(kind, ())
+        match str(self), args:
+            case "copyreg.__newobj__", (kind, *rest):
+                return Call(kind, tuple(rest))
+            case "copyreg._reconstructor", (kind, "builtins.object", None):
+                return Call(kind, ())
+            case "builtins.set" | "builtins.frozenset", (list() | tuple() as items,):
+                return set(items)  # which are hashed at once, as those of other sets
+            case _:
+                return Call(self, args)
 
 
 class Reader(pickle._Unpickler):  # pyright: ignore[reportPrivateUsage, reportAttributeAccessIssue]
@@ -202,185 +176,165 @@ class Reader(pickle._Unpickler):  # pyright: ignore[reportPrivateUsage, reportAt
         self.stream = stream
 
     def find_class(self, module: str, name: str) -> Word:
-        """The word for a class or function of the list.
+        """The word for a class or function of the list, by its package and its own name.
 
         Raises:
             InputError: If it is not in the list; nothing was imported or called.
         """
-        full, shown = Word(f"{RENAMED.get(module, module)}.{name}"), f"{module}.{name}"
-        chumpy = module.split(".")[0] == "chumpy" and name.isidentifier()
-        if chumpy or full in WORDS or full in MADE:
-            return full
-        shown = shown if shown.isprintable() and len(shown) < 200 else "a class with an odd name"
-        raise InputError(f"the pickle holds {shown}, {PLAIN}")
+        package = module.split(".")[0]
+        if package == "chumpy" and name.isidentifier():
+            return Word(f"{module}.{name}")
+        word = Word(f"{PYTHON_2.get(package, package)}.{name}")
+        if word in WORDS or word in MADE:
+            return word
+        shown = f"{module}.{name}"[:200].encode("unicode_escape").decode()
+        raise InputError(f"the pickle holds {shown}, expected arrays, numbers, text and containers")
 
     def build(self) -> None:
         """BUILD: the state of a call; behind that of joblib lies an array."""
-        READ[pickle.BUILD[0]](self)
-        call = self.stack[-1]
+        state, call = self.stack.pop(), self.stack[-1]
         if not isinstance(call, Call):
             raise ValueError("a state for something that has none")
-        if call.name == JOBLIB:
-            form, stream = _plain(call.state, {}, 0)[0], self.stream
+        call.state = state
+        if call.name == "joblib.NumpyArrayWrapper":
+            form = _plain(state, {}, 0)[0]
             if form["dtype"].hasobject:
-                call.state = Reader(stream).load()
+                call.state = Reader(self.stream).load()
                 return
             if form.get("numpy_array_alignment_bytes") is not None:
-                stream.read(stream.read(1)[0])
-            raw = stream.read(math.prod(form["shape"]) * form["dtype"].itemsize)
-            call.state = _filled(raw, form["dtype"], form["shape"], form["order"])
+                self.stream.read(self.stream.read(1)[0])
+            call.state = _filled(form["shape"], form["dtype"], form["order"], self.stream)
 
     def row(self, code: int) -> None:
         """TUPLE and its like: as a row."""
         READ[code](self)
         self.stack[-1] = Row(self.stack[-1])
 
-    dispatch: ClassVar[dict[int, Any]] = dict[int, Any](
-        {code: act for code, act in READ.items() if bytes([code]) not in REFUSED}
-        | {code: lambda reader, code=code: reader.row(code) for code in b"t\x85\x86\x87"}
-        | {
-            pickle.NEWOBJ[0]: READ[pickle.REDUCE[0]], pickle.BUILD[0]: build,
-            pickle.BYTEARRAY8[0]: READ[pickle.BINBYTES8[0]],
-        }
-    )  # fmt: skip
+    dispatch: ClassVar[dict[int, Any]] = {
+        **{code: act for code, act in READ.items() if code not in REFUSED},
+        **{code: lambda reader, code=code: reader.row(code) for code in b"t\x85\x86\x87"},
+        pickle.NEWOBJ[0]: READ[pickle.REDUCE[0]],
+        pickle.BUILD[0]: build,
+        pickle.BYTEARRAY8[0]: READ[pickle.BINBYTES8[0]],
+    }
 
 
 def _plain(value: Any, done: dict[int, Any], depth: int) -> tuple[Any, int]:  # noqa: ANN401
     """A value as a tree with each call worked out, and its bytes if all that it shares is written.
 
-    `done` has what was found for each thing by its id, with the thing, which so keeps its id.
+    `done` has what was found for each thing by its id, None while that is not yet known.
     """
     if not isinstance(value, Call | Mapping | list | tuple | set | frozenset):
-        value = _array_of(value) if isinstance(value, torch.Tensor) else value
-        letters = 4 * len(value) if isinstance(value, str | bytes) else 0
-        return value, ITEM + letters + int(getattr(value, "nbytes", 0))
+        return _leaf(value)
     if id(value) not in done:
         if depth >= DEEPEST:
             raise InputError(f"holds lists in lists in more than {DEEPEST} levels, expected fewer")
-        done[id(value)] = value, None
-        inside: Any = value.values() if isinstance(value, Mapping) else value
-        if isinstance(value, Call):
-            inside = value.args, value.state, value.items
+        done[id(value)] = None
+        parts: Any = vars(value) if isinstance(value, Call) else value
+        inside = parts.values() if isinstance(parts, Mapping) else parts
         found = [_plain(item, done, depth + 1) for item in inside]
-        plain, size = [item for item, _ in found], ITEM + sum(size for _, size in found)
-        if isinstance(value, Call):
-            plain = MADE.get(value.name, _chumpy)(value.name, *plain)
-            size = size if isinstance(plain, list | dict) else ITEM + getattr(plain, "nbytes", 0)
-        elif isinstance(value, Mapping):
-            keys = (_plain(k, done, depth)[0] if isinstance(k, Call) else k for k in value)
+        plain: Any = [item for item, _ in found]
+        size = ITEM + sum(size for _, size in found)
+        if isinstance(parts, Mapping):
+            keys = (_plain(k, done, depth)[0] if isinstance(k, Call) else k for k in parts)
             plain = dict(zip(map(str, keys), plain, strict=True))
         elif isinstance(value, set | frozenset):
             plain = set(plain)
+        if isinstance(value, Call):
+            plain = MADE.get(value.name, _chumpy)(Call(**plain))
+            if not isinstance(plain, list | dict):
+                plain, size = _leaf(plain)
         if size > LARGEST:
             raise InputError(f"unfolds to more than {LARGEST} bytes, expected at most that")
-        done[id(value)] = value, (plain, size)
-    if done[id(value)][1] is None:
+        done[id(value)] = plain, size
+    if done[id(value)] is None:
         raise InputError("holds a list that contains itself, expected a tree")
-    return done[id(value)][1]
+    return done[id(value)]
 
 
-# What the calls of the list describe: each takes its name, arguments, state and items.
+def _leaf(value: Any) -> tuple[Any, int]:  # noqa: ANN401
+    """A value without parts, a tensor as an array, and its bytes."""
+    if isinstance(value, torch.Tensor):
+        held = value.untyped_storage().nbytes()
+        if value.numel() * value.element_size() > max(held, REPEATED):
+            raise ValueError("a tensor that is larger than what it holds")
+        value = (value.float() if value.dtype == torch.bfloat16 else value).detach().numpy()
+    letters = 4 * len(value) if isinstance(value, str | bytes) else 0
+    return value, ITEM + letters + int(getattr(value, "nbytes", 0))
 
 
-def _array_of(tensor: torch.Tensor) -> np.ndarray:
-    """A tensor's numbers; those of bfloat16 as floats."""
-    held = tensor.untyped_storage().nbytes()
-    if tensor.numel() * tensor.element_size() > max(held, REPEATED):
-        raise ValueError("a tensor that is larger than what it holds")
-    plain = tensor.detach()
-    return (plain.float() if plain.dtype == torch.bfloat16 else plain).numpy()
+# What the calls of the list describe.
 
 
-def _tensor(_: str, args: list[Any], *__: object) -> np.ndarray:
+def _tensor(call: Call) -> torch.Tensor:
     """A tensor in a pickle of Python: a view of its storage."""
-    storage, offset, size, stride = args[:4]
+    storage, offset, size, stride = call.args[:4]
     try:
-        return _array_of(torch.from_numpy(storage).as_strided(size, stride, offset))
-    except TypeError as error:
-        raise ValueError("a tensor with an odd shape") from error
+        return torch.from_numpy(storage).as_strided(size, stride, offset)
     except RuntimeError as error:
         raise ValueError("a tensor that is larger than what it holds") from error
 
 
-def _bytes(_: str, args: list[Any], *__: object) -> bytes:
-    """Bytes from text or bytes, never from a size."""
-    raw, coding = [*args, *(b"", "latin1")[len(args) :]]
-    if not isinstance(raw, str | bytes | list) or coding not in ("latin1", "latin-1"):
-        raise ValueError("bytes from something else than text")
-    return raw.encode("latin1") if isinstance(raw, str) else bytes(raw)
+def _python(call: Call) -> Any:  # noqa: ANN401
+    """Containers, bytes, complex numbers and paths; none from a size."""
+    match call.name.rpartition(".")[2], call.args:
+        case "set" | "frozenset" | "list" | "tuple" | "Size", [] | [list()]:
+            return call.args[0] if call.args else []
+        case "dict" | "OrderedDict", [] | [list()]:
+            return {str(key): value for key, value in dict(*call.args).items()} | call.items
+        case "defaultdict", _:
+            return call.items  # without the maker of defaults
+        case "bytes" | "bytearray", [] | [bytes()]:
+            return b"".join(call.args)
+        case "bytes" | "bytearray" | "encode", [str() as text, "latin1" | "latin-1"]:
+            return text.encode("latin1")
+        case "complex", [float() as real, float() as imaginary]:
+            return complex(real, imaginary)
+        case "PosixPath" | "PurePosixPath" | "WindowsPath" | "PureWindowsPath", parts:
+            return "/".join(parts).replace("//", "/")
+        case _:
+            raise ValueError(f"{call.name} of something else than text, lists or numbers")
 
 
-def _list(_: str, args: list[Any], *__: object) -> list[Any]:
-    """The items of another container."""
-    if args and not isinstance(args[0], list):
-        raise ValueError("a container of something else than a list")
-    return args[0] if args else []
-
-
-def _mapping(name: str, args: list[Any], _: object, items: dict[str, Any]) -> dict[str, Any]:
-    """Of a mapping with a maker of defaults, that is not kept."""
-    pairs = args[0] if args and not name.endswith("defaultdict") else []
-    return {str(key): value for key, value in dict(pairs).items()} | items
-
-
-def _dtype(_: str, args: list[Any], state: Any, __: object) -> np.dtype[Any]:  # noqa: ANN401
-    if not isinstance(args[0], str) or not TYPES.fullmatch(args[0]):
+def _dtype(call: Call) -> np.dtype[Any]:
+    """A type of numbers, of text or of objects, in its order of bytes."""
+    (name, *_), (_, order, *fields) = call.args, call.state
+    if not TYPES.fullmatch(name) or any(x is not None for x in fields[:3]):
         raise ValueError("a type of something else than numbers and text")
-    found = np.dtype(args[0])
-    if isinstance(state, list) and len(state) > 4:
-        if any(x is not None for x in state[2:5]):
-            raise ValueError("a type with fields")
-        if state[1] in ("<", ">"):
-            found = found.newbyteorder(state[1])
-    return found
+    return np.dtype(name).newbyteorder(order)
 
 
-def _filled(raw: Any, dtype: Any, shape: Any, order: Any) -> Any:  # noqa: ANN401
+def _filled(shape: Any, dtype: Any, fortran: Any, raw: Any) -> Any:  # noqa: ANN401
     """The array of these bytes, or the nested list of these objects, as many as the shape says."""
-    whole = isinstance(shape, list) and all(type(n) is int and n >= 0 for n in shape)
-    if not isinstance(dtype, np.dtype) or not whole or len(shape) > 32:
+    if not isinstance(dtype, np.dtype) or not all(type(n) is int and n >= 0 for n in shape):
         raise ValueError("an array without type, or with an odd shape")
-    count = math.prod(shape)
+    order = "F" if fortran in (True, "F") else "C"
     if dtype.hasobject:
-        if not isinstance(raw, list) or len(raw) != count:
-            raise ValueError("an array with the wrong number of objects")
-        return np.fromiter(raw, object, count).reshape(shape, order=order).tolist()
-    data = raw.encode("latin1") if isinstance(raw, str) else raw
-    if not isinstance(data, bytes) or len(data) != count * dtype.itemsize:
+        return np.fromiter(raw, object, len(raw)).reshape(shape, order=order).tolist()
+    size = math.prod(shape) * dtype.itemsize
+    data = raw.read(size) if isinstance(raw, BytesIO) else raw
+    data = data.encode("latin1") if isinstance(data, str) else data
+    if not isinstance(data, bytes) or len(data) != size:
         raise ValueError("an array whose bytes do not fit its shape")
-    if not count or not dtype.itemsize:
-        return np.zeros((0,) if not dtype.itemsize else shape, dtype)
-    return np.frombuffer(bytearray(data), dtype).reshape(shape, order=order)
+    return np.ndarray(shape, dtype, bytearray(data), order=order)
 
 
-def _array(_: str, args: list[Any], state: Any, __: object) -> Any:  # noqa: ANN401
-    if args[0] not in ("numpy.ndarray", "numpy.memmap") or not isinstance(state, list):
-        raise ValueError("an array without content")
-    shape, dtype, fortran, raw = state[-4:]
-    return _filled(raw, dtype, shape, "F" if fortran else "C")
-
-
-def _sparse(name: str, _: object, state: Any, __: object) -> Any:  # noqa: ANN401
+def _sparse(call: Call) -> Any:  # noqa: ANN401
     """A scipy matrix from its arrays, whose indices scipy checks."""
     from scipy import sparse
 
-    form = name.rpartition(".")[2][:3]
-    parts = ("row", "col") if form == "coo" else ("indices", "indptr")
-    arrays = [state["data"], *(state.get("coords") or [state[part] for part in parts])]
+    state, kind = call.state, getattr(sparse, call.name.rpartition(".")[2])
     shape = state.get("_shape", state.get("shape"))
-    if not all(isinstance(a, np.ndarray) and a.ndim == 1 for a in arrays) or len(shape) != 2:
-        raise ValueError("a sparse matrix without its arrays")
-    if form == "coo":
-        return sparse.coo_matrix((arrays[0], (arrays[1], arrays[2])), shape=shape)
-    kind = sparse.csc_matrix if form == "csc" else sparse.csr_matrix
-    matrix = kind(tuple(arrays), shape=shape)
+    if "indptr" not in state:
+        return kind((state["data"], state.get("coords") or (state["row"], state["col"])), shape)
+    matrix = kind((state["data"], state["indices"], state["indptr"]), shape)
     matrix.check_format(full_check=True)
     return matrix
 
 
-def _chumpy(name: str, _: object, state: Any, __: object) -> np.ndarray:  # noqa: ANN401
+def _chumpy(call: Call) -> np.ndarray:
     """The array in an object of chumpy: its value, or a selection, a new shape of another's."""
-    match state:
+    match call.state:
         case {"x": np.ndarray() as value}:
             return value
         case {"a": np.ndarray() as base, "idxs": np.ndarray() as chosen, "preferred_shape": shape}:
@@ -388,39 +342,36 @@ def _chumpy(name: str, _: object, state: Any, __: object) -> np.ndarray:  # noqa
         case {"a": np.ndarray() as base, "newshape": shape}:
             return base.reshape(shape)
         case _:
-            raise InputError(f"the pickle holds {name} without an array, expected its values")
+            raise InputError(f"the pickle holds {call.name} without an array, expected its values")
 
 
-JOBLIB = "joblib.numpy_pickle.NumpyArrayWrapper"
+PYTHON_2 = {"__builtin__": "builtins", "copy_reg": "copyreg"}
+"""What its packages are called today."""
 WORDS = {
-    "copyreg._reconstructor", "copyreg.__newobj__", "numpy.ndarray", "numpy.memmap", "torch.bool",
-    "torch.bfloat16", *(f"builtins.{name}" for name in ("object", "int", "float", "str", "bool")),
-    *(f"{module}.{kind}{bits}" for module in ("numpy", "torch") for kind, sizes in
-      (("float", (16, 32, 64)), ("int", (8, 16, 32, 64)), ("uint", (8,))) for bits in sizes),
+    "copyreg._reconstructor", "copyreg.__newobj__", "numpy.ndarray", "numpy.memmap",
+    *(f"builtins.{kind}" for kind in ("object", "int", "float", "str", "bool")),
+    *(f"{package}.{kind}" for package in ("numpy", "torch") for kind in (
+        "float16", "float32", "float64", "bfloat16", "bool", "uint8", "int8", "int16", "int32",
+        "int64")),
 }  # fmt: skip
 """What a pickle may name, but not call; but for copyreg's two, see `Word`."""
-MADE: Mapping[str, Callable[..., Any]] = {
-    **dict.fromkeys((*SETS, "builtins.list", "builtins.tuple", "torch.Size"), _list),
-    **dict.fromkeys(
-        ("builtins.dict", "collections.OrderedDict", "collections.defaultdict"), _mapping
-    ),
-    **dict.fromkeys(("builtins.bytes", "builtins.bytearray", "_codecs.encode"), _bytes),
-    "builtins.complex": lambda _, args, *__: complex(*args),
-    **dict.fromkeys(
-        (f"pathlib.{name}Path" for name in ("Posix", "PurePosix", "Windows", "PureWindows")),
-        lambda _, args, *__: "/".join(args).replace("//", "/"),
-    ),
+MADE: Mapping[str, Callable[[Call], Any]] = {
+    **dict.fromkeys((
+        *(f"builtins.{kind}" for kind in ("set", "frozenset", "list", "tuple", "dict", "bytes",
+                                          "bytearray", "complex")),
+        *(f"pathlib.{kind}Path" for kind in ("Posix", "PurePosix", "Windows", "PureWindows")),
+        "collections.OrderedDict", "collections.defaultdict", "_codecs.encode", "torch.Size",
+    ), _python),
     "numpy.dtype": _dtype,
-    "numpy.core.multiarray._reconstruct": _array,
-    "numpy.core.multiarray.scalar": lambda _, args, *__: _filled(args[1], args[0], [1], "C")[0],
-    "numpy.core.numeric._frombuffer": lambda _, args, *__: _filled(*args),
-    **{f"scipy.sparse.{form}_{kind}": _sparse for form in ("csc", "csr", "coo")
+    "numpy._reconstruct": lambda call: _filled(*call.state[-4:]),
+    "numpy._frombuffer": lambda call: _filled(*(call.args[part] for part in (2, 1, 3, 0))),
+    "numpy.scalar": lambda call: _filled([1], call.args[0], False, call.args[1])[0],
+    **{f"scipy.{form}_{kind}": _sparse for form in ("csc", "csr", "coo")
        for kind in ("matrix", "array")},
-    JOBLIB: lambda *parts: parts[2],  # the reader put the array there
-    **dict.fromkeys(
-        ("torch.device", "torch._utils._rebuild_parameter"), lambda _, args, *__: args[0]
-    ),
-    "torch._utils._rebuild_tensor_v2": _tensor,
-    "torch.storage._load_from_bytes": lambda _, args, *__: _plain(_of_torch(args[0]), {}, 0)[0],
+    "joblib.NumpyArrayWrapper": lambda call: call.state,  # the reader put the array there
+    "torch.device": lambda call: call.args[0],
+    "torch._rebuild_parameter": lambda call: call.args[0],
+    "torch._rebuild_tensor_v2": _tensor,
+    "torch._load_from_bytes": lambda call: _plain(_of_torch(call.args[0]), {}, 0)[0],
 }  # fmt: skip
 """What a pickle may call: worked out by functions that are all written here."""

@@ -42,7 +42,7 @@ def encoded(
         return Energy({"turns": miss, "size": 3e-4 * values["code"].square().sum(-1)}).total
 
     start = {"code": angles.new_zeros(len(angles), prior.width)}
-    return solved(start, start, energy, ENCODING_STEPS, 2 * ENCODING_STEPS, 1e-6)["code"]
+    return solved(start, energy, ENCODING_STEPS)["code"]
 
 
 BODY_JOINTS = 21

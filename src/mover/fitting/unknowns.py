@@ -262,4 +262,4 @@ def solve(
         return dataclasses.replace(start, **{n: v * scale[n] for n, v in values.items()})
 
     values = {name: (getattr(start, name) / scale[name]).detach() for name in scale}
-    return real(solved(values, values, lambda v: energy(real(v)).total, steps, 2 * steps, 1e-6))
+    return real(solved(values, lambda v: energy(real(v)).total, steps))

@@ -29,8 +29,10 @@ MOST_MATERIALS = 500  # of an .obj
 PACKED = {"KHR_draco_mesh_compression": "Draco", "EXT_meshopt_compression": "meshopt"}
 MAPS = re.compile(r"(?im)^\s*(?:map_\w+|bump|disp|decal|refl|norm)\s+(.+?)\s*$")
 """A picture in a file of materials."""
-NUMBERED = {"-o": 3, "-s": 3, "-t": 3, "-mm": 2}
-"""Options of a texture with up to so many numbers; all others have one word."""
+OPTION = re.compile(
+    r"-(?:([ost])((?: [-+.\deE]+){0,3})|mm(?: [-+.\deE]+){0,2}|[a-z]\w*(?: \S+)?) (?=\S)"
+)
+"""An option of a texture before another word: some have numbers, all others one word."""
 
 
 @dataclass(frozen=True)
@@ -236,21 +238,12 @@ def _libraries(text: str, path: Path) -> list[Path]:
 
 def _map(line: str) -> tuple[str, bool]:
     """The file of a texture, without the options before it, and whether they move the picture."""
-    words, moved = line.split(), False
-    while len(words) > 1 and re.fullmatch(r"-[a-z]\w*", words[0]):
-        option, most = words[0], NUMBERED.get(words[0], 1)
-        taken = 1
-        while (
-            taken <= most
-            and taken < len(words) - 1
-            and (option not in NUMBERED or re.fullmatch(r"[-+.\deE]+", words[taken]))
-        ):
-            taken += 1
-        identity = {"-s": {"1"}, "-o": {"0"}, "-t": {"0"}}.get(option)
-        values = {f"{float(w):g}" for w in words[1:taken]} if identity is not None else set[str]()
-        moved = moved or bool(values - (identity or set()))
-        words = words[taken:]
-    return " ".join(words), moved
+    name, moved = " ".join(line.split()), False
+    while option := OPTION.match(name):
+        usual = 1 if option[1] == "s" else 0
+        moved = moved or any(float(word) != usual for word in (option[2] or "").split())
+        name = name[option.end() :]
+    return name, moved
 
 
 def _obj(path: Path, *, looks: bool) -> Source:
