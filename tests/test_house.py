@@ -24,7 +24,7 @@ LINES = {
     "src/mover/fitting": 2_097,
     "src/mover/furniture": 955,
     "src/mover/geometry": 3_529,
-    "src/mover/io": 10_579,
+    "src/mover/io": 10_560,
     "src/mover/perceive": 2_865,
     "src/mover/pipeline": 1_225,
     "src/mover/stages": 6_134,
@@ -37,7 +37,7 @@ LIMITS = {
     "words in code": 0,
     "words in pages": 0,
     "class names with two meanings": 0,
-    "small helpers": 65,
+    "small helpers": 64,
     "modules in circles": 0,
 }  # fmt: skip
 WORDS = {
