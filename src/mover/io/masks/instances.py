@@ -198,7 +198,7 @@ def code_in(given: At | None, size: Size | None) -> bytes | None:
     if size is None:
         given.refuse("the size of the image beside polygons: give --image")
     width, height = size
-    code = from_coco(given.value, height, width, given.place)
+    code = from_coco(given, height, width)
     return code if area(Masks(height, width, (code,)), 0) else None
 
 
