@@ -5,7 +5,7 @@ the true one it keeps the pixel of its middle and its size in pixels.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -29,7 +29,7 @@ def lens(fx: float, fy: float, cx: float, cy: float) -> At:
 
 
 def assumed_lens(
-    known: Known, focal: Callable[[float, float], float], size: tuple[float, float] | None = None
+    known: Known, focal: Callable[[float, float], float], size: Sequence[float] | None = None
 ) -> At | None:
     """The lens that most tools assume: the principal point is the image's middle.
 

@@ -278,25 +278,21 @@ def phalp(path: Path, known: Known) -> Iterator[Person]:
     of 256 px at 5000 px, the image padded to a square.
     """
     source = v.read_one(path, "the results of PHALP", "**/*.pkl")
-    frames = source.mapping()
-    for index, name in enumerate(sorted(frames, key=lambda key: v.natural(Path(str(key))))):
-        at = At(frames[name], source.file, str(name))
-        camera = need(at, "camera")
+    for index, name in enumerate(sorted(source.mapping(), key=lambda key: v.natural(Path(key)))):
+        at = source.get(name)
+        bodies, tracks = need(at, "smpl").items(), v.whole(need(at, "tid")).tolist()
+        camera, ages = need(at, "camera"), at.maybe("tracked_time")
         listed = list(camera.value) if isinstance(camera.value, np.ndarray) else camera.value
-        bodies, cameras = need(at, "smpl").items(), camera.holding(listed).items()
-        tracks = v.whole(need(at, "tid"))
-        ages, sizes, time = at.maybe("tracked_time"), at.maybe("size"), at.maybe("time")
+        cameras = camera.holding(listed).items()
         if not len(bodies) == len(cameras) == len(tracks):
             n = f"{len(tracks)} tracks, {len(bodies)} bodies and {len(cameras)} cameras"
             raise InputError(f"{at.place} has {n}, expected as many of each")
         age = np.zeros(len(tracks)) if ages is None else v.numbers(ages).reshape(-1)
-        size = None
-        if sizes is not None and len(tracks):
-            height, width = v.stacked(sizes, 2)[0].tolist()
-            size = width, height
+        sizes, time = at.maybe("size"), at.maybe("time")
+        size = v.stacked(sizes, 2)[0, ::-1].tolist() if sizes is not None and tracks else None
         K = assumed_lens(known, lambda *sides: FOCAL / CROP * max(sides), size)
         frame = index if time is None or v.one_number(time) < 0 else int(v.one_number(time))
-        for k, track in enumerate(tracks.tolist()):
+        for k, track in enumerate(tracks):
             if len(age) != len(tracks) or age[k] == 0:
                 body = at.holding({**bodies[k].mapping(), "camera": cameras[k].value})
                 yield Person(body, track, frame, K=K)
@@ -389,8 +385,7 @@ def sam3dbody(path: Path, known: Known) -> Iterator[Person]:
     images = [f.with_stem(re.sub(r"_?(?:subj|person|human)_?\d+$", "", f.stem)) for f in files]
     for file, frame in zip(files, v.frames_in(images, path, known), strict=True):
         at = v.read_any(file)
-        people = at.value.tolist() if isinstance(at.value, np.ndarray) else at.value
-        for one in [at] if isinstance(people, Mapping) else At(people, at.file).items():
+        for one in [at] if isinstance(at.value, Mapping) else at.items():
             yield Person(one, None, frame, K=_lens_of_joints(one, known))
 
 
