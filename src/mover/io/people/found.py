@@ -106,11 +106,12 @@ def followed(
     last: dict[int, int] = {}
     for frame in sorted(set(frames)):
         current: list[int] = np.flatnonzero(order == frame).tolist()
+        recent = [(t, before) for t, before in last.items() if frame - frames[before] <= PATIENCE]
         options: list[tuple[float, int, int]] = []
-        for (track, before), row in product(last.items(), current):
+        for (track, before), row in product(recent, current):
             gap, size = frame - frames[before], max(sizes[row], sizes[before], 1e-9)
             way = float(np.linalg.norm(positions[row] - positions[before]) / size)
-            if gap <= PATIENCE and way <= REACH * (1 + GROWTH * (gap - 1)):
+            if way <= REACH * (1 + GROWTH * (gap - 1)):
                 options.append((way, track, row))
         for _, track, row in sorted(options):
             if tracks[row] < 0 and last[track] not in current:
