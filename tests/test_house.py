@@ -15,29 +15,29 @@ import pytest
 
 HOME = Path(__file__).parents[1]
 LINES = {
-    "src/mover/app": 4_283,
+    "src/mover/app": 4_286,
     "src/mover/bodies": 2_017,
-    "src/mover/core": 1_558,
+    "src/mover/core": 1_559,
     "src/mover/energy": 3_818,
     "src/mover/evaluate": 1_027,
     "src/mover/extensions": 1_235,
     "src/mover/fitting": 2_097,
     "src/mover/furniture": 955,
-    "src/mover/geometry": 3_529,
-    "src/mover/io": 10_608,
+    "src/mover/geometry": 3_530,
+    "src/mover/io": 10_547,
     "src/mover/perceive": 2_865,
     "src/mover/pipeline": 1_225,
     "src/mover/stages": 6_134,
     "bench": 7_553,
     "benchmarks": 1_111,
-    "tests": 29_880,
+    "tests": 29_900,
 }
 FILES = {"src/mover": 239, "bench": 41}
 LIMITS = {
     "words in code": 0,
     "words in pages": 0,
     "class names with two meanings": 0,
-    "small helpers": 63,
+    "small helpers": 62,
     "modules in circles": 0,
 }  # fmt: skip
 WORDS = {

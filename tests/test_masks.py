@@ -1,6 +1,5 @@
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,10 +13,11 @@ from tiny_capture import compressed, runs
 from mover.core.errors import InputError
 from mover.core.types import Masks
 from mover.geometry.rle import area, decode, encode, run_lengths, tight_box
+from mover.io.files.fields import At
 from mover.io.masks.coco import from_coco
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
-WHERE = "objects.json: field 'segmentation'"
+AT = At(None, "objects.json", "segmentation")
 MASKS = arrays(np.bool_, st.tuples(st.integers(1, 9), st.integers(1, 13)))
 
 
@@ -25,7 +25,7 @@ def corners(box: np.ndarray) -> list[float]:
     return [box[0], box[1], box[0] + box[2], box[1] + box[3]]
 
 
-def image_of(code: bytes, shape: Any) -> np.ndarray:
+def image_of(code: bytes, shape: list[int] | tuple[int, ...]) -> np.ndarray:
     return decode(Masks(shape[0], shape[1], (code,)), 0).numpy()
 
 
@@ -34,7 +34,7 @@ def test_both_codes_and_the_encoder_give_the_mask_back(mask):
     counts, code = runs(mask), encode(torch.from_numpy(mask))
     written = (counts, compressed(counts), compressed(counts).encode())
     size = list(mask.shape)
-    read = [from_coco({"size": size, "counts": one}, *size, WHERE) for one in written]
+    read = [from_coco(AT.holding({"size": size, "counts": one}), *size) for one in written]
     assert all((image_of(one, mask.shape) == mask).all() for one in (*read, code))
     assert area(Masks(*size, (code,)), 0) == mask.sum()
 
@@ -47,16 +47,16 @@ def test_a_compressed_code_holds_its_runs(counts):
 @given(st.binary(max_size=12) | st.text(max_size=12))
 def test_a_code_of_noise_is_refused_or_fits_the_image(code):
     try:
-        found = from_coco({"size": [3, 5], "counts": code}, 3, 5, WHERE)
+        found = from_coco(AT.holding({"size": [3, 5], "counts": code}), 3, 5)
     except InputError as error:
-        assert str(error).startswith(WHERE)  # noqa: PT017
+        assert str(error).startswith(AT.place)  # noqa: PT017
     else:
         assert image_of(found, (3, 5)).shape == (3, 5)
 
 
 def test_polygons_are_joined_and_clipped():
     outlines = [[-3, -2, 2, -2, 2, 3, -3, 3], [5, 0, 8, 0, 8, 6, 5, 6]]
-    found = image_of(from_coco(outlines, 6, 7, WHERE), (6, 7))
+    found = image_of(from_coco(AT.holding(outlines), 6, 7), (6, 7))
     expected = np.zeros((6, 7), dtype=bool)
     expected[:3, :2] = expected[:, 5:] = True
     assert (found == expected).all()
@@ -94,8 +94,8 @@ def test_polygons_are_joined_and_clipped():
 ])  # fmt: skip
 def test_a_malformed_mask_is_named_with_its_place(segmentation, words):
     with pytest.raises(InputError, match=words) as caught:
-        from_coco(segmentation, 3, 5, WHERE)
-    assert str(caught.value).startswith(WHERE)
+        from_coco(AT.holding(segmentation), 3, 5)
+    assert str(caught.value).startswith(AT.place)
     assert "expected" in str(caught.value)
 
 
@@ -115,7 +115,7 @@ WAYS = {
 def test_a_mask_is_read_as_people_write_it(way):
     expected = np.zeros((6, 9), dtype=bool)
     expected[1:4, 2:7] = True
-    found = image_of(from_coco(WAYS[way](compressed(runs(expected))), 6, 9, WHERE), (6, 9))
+    found = image_of(from_coco(AT.holding(WAYS[way](compressed(runs(expected)))), 6, 9), (6, 9))
     assert (found == expected).all()
     assert tight_box(torch.from_numpy(found)).tolist() == [2, 1, 7, 4]
 
@@ -127,7 +127,7 @@ class TestRealFiles:
         rows = json.loads(file.read_text())
         for row in rows[::40]:
             code = row["segmentation"]
-            found = image_of(from_coco(code, *code["size"], WHERE), code["size"])
+            found = image_of(from_coco(AT.holding(code), *code["size"]), code["size"])
             assert found.sum() == coco.area(code)
             assert tight_box(torch.from_numpy(found)).tolist() == corners(coco.toBbox(code))
             assert run_lengths(code["counts"].encode()).tolist() == runs(found)
@@ -137,5 +137,5 @@ class TestRealFiles:
         codes = [code for frame in tree["masklet"][:3] for code in frame]
         assert codes
         for code in codes:
-            found = image_of(from_coco(code, *code["size"], WHERE), code["size"])
+            found = image_of(from_coco(AT.holding(code), *code["size"]), code["size"])
             assert found.sum() == coco.area(code)

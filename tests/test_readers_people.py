@@ -637,7 +637,7 @@ def test_people_without_joints_are_left_out_and_no_person_is_refused(tmp_path):
 def test_joints_with_nan_are_missing_and_another_number_of_them_is_refused(tmp_path):
     path = made.write_coco17(tmp_path)
     rows = load(path)
-    rows[0]["keypoints"][15] = float("nan")
+    rows[0]["keypoints"][15], rows[0]["track_id"] = float("nan"), float("inf")
     dump(rows, path)
     found = keypoints_from("coco17", path)
     assert found.confidence[0, 5] == 0

@@ -88,6 +88,7 @@ FORMATS = (
             ("phalp", "results/demo_*.pkl of PHALP"),
             ("prompthmr", "results.pkl of PromptHMR"),
             ("prox", "results/ of PROX's fits"),
+            ("sam3dbody", "a folder of SAM 3D Body"),
             ("slahmr", "*_world_results.npz of SLAHMR"),
             ("smplifyx", "results/ of SMPLify-X"),
             ("tram", "a folder of TRAM"),
@@ -95,7 +96,6 @@ FORMATS = (
             ("wham", "wham_output.pkl of WHAM"),
         )
     ),
-    Format("people", "sam3dbody", "a folder of SAM 3D Body", "people.tools:read_sam3dbody"),
     Format("cameras", "colmap", "images.txt of COLMAP's text model", "people.paths:read_colmap"),
     Format("cameras", "gvhmr", "slam_results.pt of GVHMR", "people.paths:read_slam"),
     Format("cameras", "megasam", "*_sgd_cvd_hr.npz of MegaSaM", "people.paths:read_megasam"),

@@ -4,13 +4,12 @@ import ast
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from mover.core.errors import InputError
 from mover.core.types import Camera, Masks
 from mover.geometry.rle import run_lengths
 from mover.io.files.fields import LAST_ID, At, Warn, unique
@@ -37,16 +36,17 @@ MOST_THINGS = 5000  # in one picture
 CORNERS = 3  # a polygon has at least so many
 
 
-def from_coco(segmentation: Any, height: int, width: int, where: str) -> bytes:  # noqa: ANN401
+def from_coco(at: At, height: int, width: int) -> bytes:
     """The compressed run-length code of COCO's polygons or of either of its run-length codes.
 
-    Height and width are those of the image [px]; `where` is file and field, for messages.
+    Height and width are those of the image [px].
 
     Raises:
         InputError: If it is malformed or does not fit the image. It may be empty.
     """
     from pycocotools import mask as coco
 
+    segmentation: Any = at.value
     if isinstance(segmentation, str):  # printed by Python, or a code that belongs to this image
         whole = {"size": [height, width], "counts": segmentation}
         start = segmentation.strip()[:1]
@@ -54,30 +54,26 @@ def from_coco(segmentation: Any, height: int, width: int, where: str) -> bytes: 
     if isinstance(segmentation, list | tuple):
         polygons = _nested(segmentation)
         if not polygons:
-            _wrong(where, "no polygon", "[[x, y, ...], ...]")
+            at.refuse("[[x, y, ...], ...]", "no polygon")
         for i, polygon in enumerate(polygons):
-            _check_polygon(polygon, 2 * max(height, width), where, f"polygon {i} with")
+            _check_polygon(polygon, 2 * max(height, width), at, f"polygon {i} with")
         outlines: Any = [[float(v) for v in polygon] for polygon in polygons]
         return coco.merge(coco.frPyObjects(outlines, height, width))["counts"]  # pyright: ignore
     if not isinstance(segmentation, dict):
         kinds = "polygons [[x, y, ...], ...] or a run-length code {size, counts}"
-        _wrong(where, type(segmentation).__name__, kinds)
+        at.refuse(kinds, type(segmentation).__name__)
     size, counts = segmentation.get("size"), segmentation.get("counts")
     size = _unprinted(size, size) if isinstance(size, str) else size
     if not isinstance(size, list | tuple) or tuple(size) != (height, width):
-        _wrong(where, f"size {str(size)[:40]}", f"[{height}, {width}] (h, w)")
-    runs = _runs(counts, where)
+        at.refuse(f"[{height}, {width}] (h, w)", f"size {str(size)[:40]}")
+    runs = _runs(counts, at)
     if (runs < 0).any() or runs.sum() != height * width:
         found = f"runs that sum to {runs.sum()}" if (runs >= 0).all() else "a negative run"
-        _wrong(where, f"counts with {found}", f"runs that sum to {height} x {width}")
+        at.refuse(f"runs that sum to {height} x {width}", f"counts with {found}")
     if isinstance(counts, bytes):
         return counts
     code: Any = {"size": [height, width], "counts": [int(n) for n in runs]}
     return coco.frPyObjects(code, height, width)["counts"]  # pyright: ignore
-
-
-def _wrong(where: str, found: str, expected: str) -> NoReturn:
-    raise InputError(f"{where} has {found}, expected {expected}")
 
 
 def _unprinted(written: str, other: Any) -> Any:  # noqa: ANN401
@@ -110,37 +106,37 @@ def is_drawn(segmentation: Any) -> bool:  # noqa: ANN401
     return segmentation is not None
 
 
-def _runs(counts: Any, where: str) -> NDArray[np.int64]:  # noqa: ANN401
+def _runs(counts: Any, at: At) -> NDArray[np.int64]:  # noqa: ANN401
     """The runs of a code of either kind."""
     if isinstance(counts, list | tuple):
         if not all(type(n) is int and abs(n) < 1 << 40 for n in counts):
-            _wrong(where, "a list of counts", "whole numbers in it")
+            at.refuse("whole numbers in it", "a list of counts")
         return np.array(counts, dtype=np.int64)
     if not isinstance(counts, str | bytes):
-        name = type(counts).__name__
-        _wrong(where, f"{name} as counts", "a list of runs or a compressed code")
+        found = f"{type(counts).__name__} as counts"
+        at.refuse("a list of runs or a compressed code", found)
     if isinstance(counts, str) and re.fullmatch(r"b'.*'|b\".*\"", counts):
         counts = _unprinted(counts, counts)
     try:
         return run_lengths(counts if isinstance(counts, bytes) else counts.encode("ascii"))
     except ValueError as error:
-        _wrong(where, f"counts with {error}", "COCO's compressed code")
+        at.refuse("COCO's compressed code", f"counts with {error}")
 
 
-def _check_polygon(polygon: Any, reach: float, where: str, what: str) -> None:  # noqa: ANN401
+def _check_polygon(polygon: Any, reach: float, at: At, what: str) -> None:  # noqa: ANN401
     """Refuse what the rasteriser would crash on or draw as nonsense."""
     given: Any = polygon if isinstance(polygon, list | tuple) else ()
     words = [v for v in given if isinstance(v, str)]
     if words:
-        _wrong(where, f"{what} text ({words[0][:40]!r})", "numbers x, y without quotes")
+        at.refuse("numbers x, y without quotes", f"{what} text ({words[0][:40]!r})")
     real = all(type(v) in (int, float) for v in given)
     if not real or len(given) < 2 * CORNERS or len(given) % 2:
         found = f"{len(given)} items" if polygon is given and real else str(polygon)[:40]
-        _wrong(where, f"{what} {found}", f"numbers x, y of {CORNERS} corners or more")
+        at.refuse(f"numbers x, y of {CORNERS} corners or more", f"{what} {found}")
     if not all(-reach <= v <= reach for v in given):
-        _wrong(where, f"{what} a corner far outside", "pixels of the image")
+        at.refuse("pixels of the image", f"{what} a corner far outside")
     if all(0 <= v <= 1 for v in given) and any(0 < v < 1 for v in given):
-        _wrong(where, f"{what} shares of the image (0 to 1)", "pixels: times width and height")
+        at.refuse("pixels: times width and height", f"{what} shares of the image (0 to 1)")
 
 
 def check_image(at: At, camera: Camera) -> int:
@@ -181,7 +177,7 @@ def mask_of(at: At, camera: Camera, warn: Warn) -> Masks | None:
     if given is None or not is_drawn(given.value):
         return None
     size, polygons = (camera.height, camera.width), isinstance(given.value, list)
-    code = from_coco(given.value, *size, given.place)
+    code = from_coco(given, *size)
     for k, side in ((0, camera.width), (1, camera.height)) if polygons else ():
         ends = [v for polygon in _nested(given.value) for v in polygon[k::2]]
         if min(ends) < -1 or max(ends) > side + 1:  # by more than a pixel

@@ -17,7 +17,7 @@ from mover.io.masks.coco import COCO_CLASSES, COCO_IDS, MOST_THINGS, CategoryFie
 from mover.io.masks.instances import Instance, Instances, Names, Size, code_in, frames_of, mask_code
 from mover.io.masks.label_images import PICTURES, pictures_in, read_label_images, read_mask_arrays
 from mover.io.masks.labelme import labelme_instances
-from mover.io.people.values import PICKLES, natural, number_in
+from mover.io.people.values import PICKLES, lone, natural, number_in
 
 LEAST_SCORE = 0.3  # of MMDetection, which writes everything that it thought of
 EXPORTS = {
@@ -183,7 +183,7 @@ def _of_json(at: At, names: Names, size: Size | None, picture: str | None) -> In
         return list_instances(at, names, size)
     (have,) = keys
     if have & {"box_format", "img_width"}:
-        return _of_grounded_sam(at)
+        return coco_instances(_of_grounded_sam(at), names, size, picture)
     if "predictions" in have or {"labels", "scores"} <= have:
         return _of_mmdet(at, names, size)
     if "annotations" in have and "image" in have - {"images"} and "images" not in have:  # SA-1B
@@ -395,20 +395,19 @@ def _corners(at: At, *, sized: bool) -> tuple[float, ...]:
     return (a, b, a + c, b + d) if sized else (a, b, c, d)
 
 
-def _of_grounded_sam(at: At) -> Instances:
-    """The results of Grounded-SAM-2's demos of pictures, with DUMP_JSON_RESULTS."""
-    size = checked(at.get("img_width"), Side), checked(at.get("img_height"), Side)
+def _of_grounded_sam(at: At) -> At:
+    """The results of Grounded-SAM-2's demos of a picture, with DUMP_JSON_RESULTS, as COCO's."""
     sized = at.get("box_format").choice(("xyxy", "xywh")) == "xywh"
-    found: list[Instance] = []
+    rows: list[dict[str, Any]] = []
     for item in at.get("annotations").items():
-        name, box, given = item.get("class_name"), item.maybe("bbox"), item.get("segmentation")
-        category = name.text() if name.value != "" else UNKNOWN
-        corners, score = None if box is None else _corners(box, sized=sized), item.maybe("score")
-        while score is not None and isinstance(score.value, list) and len(score.value) == 1:
-            (score,) = score.items()
-        sure = 1.0 if score is None else min(score.number(0, 2), 1.0)  # SAM 2's may be above 1
-        found.append(Instance(category, corners, code_in(given, size), sure))
-    return Instances(tuple(found), size, at.file)
+        name, box, score = item.get("class_name"), item.maybe("bbox"), item.maybe("score")
+        sure = 1.0 if score is None else score.holding(lone(score)).number(0, 2)
+        row = {"class": UNKNOWN if name.value == "" else name.text(), "image_id": 0}
+        row |= {"score": min(sure, 1.0)}  # SAM 2's may be above 1
+        row |= {} if box is None else {"bbox": _corners(box, sized=sized)}
+        rows.append({**row, "segmentation": item.get("segmentation").value})
+    image = {"id": 0, "width": at.get("img_width").value, "height": at.get("img_height").value}
+    return at.holding({"images": [image], "annotations": rows})
 
 
 def _of_mmdet(at: At, names: Names, size: Size | None) -> Instances:

@@ -155,10 +155,9 @@ class Instances:
                 best.setdefault((item.frame, item.track), item)
         notes = self.notes
         if free:
-            boxes = np.array([_box_of(item, self.size) for item in free]).reshape(-1, 4)
-            left = (boxes[:, 0] + boxes[:, 2]).tolist()
-            order = sorted(range(len(free)), key=lambda k: (free[k].frame, left[k]))
-            boxes, free = boxes[order] / 2, [free[k] for k in order]
+            placed = [(item, _box_of(item, self.size)) for item in free]
+            placed.sort(key=lambda pair: (pair[0].frame, pair[1][0] + pair[1][2]))
+            free, boxes = [item for item, _ in placed], np.array([box for _, box in placed]) / 2
             sizes = np.linalg.norm(boxes[:, 2:] - boxes[:, :2], axis=1)
             frames = [item.frame for item in free]
             lone = len(set(frames)) == len(frames)  # never two at a time: it is one person
@@ -198,7 +197,7 @@ def code_in(given: At | None, size: Size | None) -> bytes | None:
     if size is None:
         given.refuse("the size of the image beside polygons: give --image")
     width, height = size
-    code = from_coco(given.value, height, width, given.place)
+    code = from_coco(given, height, width)
     return code if area(Masks(height, width, (code,)), 0) else None
 
 

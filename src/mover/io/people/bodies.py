@@ -46,25 +46,22 @@ def bodies_from(tool: str, path: Path, known: Known | None = None) -> ImportedBo
     warnings = [f"{file}: {text}" for text in found.warnings]
     found = _tracked(_sound(found, file, warnings), known, file, warnings)
     found = _in_order(found, file)
-    values = found.values
-    model = None if "verts" in values else load_model(found.model, found.gender)
-    if model is None:
-        pose, verts, joints = None, values["verts"], None
-    else:
+    values, model, pose, joints = found.values, None, None, None
+    verts, lens = values.get("verts"), None if known.camera is None else known.camera.K.float()
+    if verts is None:
+        model = load_model(found.model, found.gender)
         pose = _posed_as(model, found)
         try:
             verts, joints = run_model(model, pose)
         except InputError as error:
             raise InputError(f"{file}: {error}") from error
-    assumed = values["K"].median(0).values if "K" in values else None
-    lens = assumed if known.camera is None else known.camera.K.float()
     if known.camera is not None and "K" in values:
         used, true = values["K"].double(), known.camera.K.double()
-        shift = refocused(verts.mean(1).double(), used, true)
-        if shift is not None:
-            verts = verts + shift[:, None].float()
-            joints = None if joints is None else joints + shift[:, None].float()
-            pose = pose and dataclasses.replace(pose, transl=pose.transl + shift.float())
+        shift = refocused(verts.mean(1).double(), used, true).float()
+        verts, joints = verts + shift[:, None], None if joints is None else joints + shift[:, None]
+        pose = pose and dataclasses.replace(pose, transl=pose.transl + shift)
+    elif "K" in values:
+        lens = values["K"].median(0).values
     if not (verts.abs() <= LARGEST).all():
         raise InputError(f"{file}: has bodies at positions that are not finite under this lens")
     bodies = Bodies(

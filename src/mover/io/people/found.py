@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Literal
 
@@ -101,28 +102,22 @@ def followed(
         positions: (rows, axes), in any unit.
         sizes: (rows,), sizes in the same unit.
     """
-    tracks = np.full(len(frames), -1, dtype=np.int64)
+    tracks, order = np.full(len(frames), -1, dtype=np.int64), np.asarray(frames)
     last: dict[int, int] = {}
-    order = np.asarray(frames)
-    for frame in sorted(set(order.tolist())):
-        current = np.flatnonzero(order == frame)
+    for frame in sorted(set(frames)):
+        current: list[int] = np.flatnonzero(order == frame).tolist()
+        recent = [(t, before) for t, before in last.items() if frame - frames[before] <= PATIENCE]
         options: list[tuple[float, int, int]] = []
-        for track, before in last.items():
-            gap = frame - int(order[before])
-            if gap > PATIENCE:
-                continue
-            for row in current:
-                size = max(sizes[row], sizes[before], 1e-9)
-                way = float(np.linalg.norm(positions[row] - positions[before]) / size)
-                if way <= REACH * (1 + GROWTH * (gap - 1)):
-                    options.append((way, track, int(row)))
-        taken: set[int] = set()
+        for (track, before), row in product(recent, current):
+            gap, size = frame - frames[before], max(sizes[row], sizes[before], 1e-9)
+            way = float(np.linalg.norm(positions[row] - positions[before]) / size)
+            if way <= REACH * (1 + GROWTH * (gap - 1)):
+                options.append((way, track, row))
         for _, track, row in sorted(options):
-            if track not in taken and tracks[row] < 0:
-                tracks[row] = track
-                taken.add(track)
+            if tracks[row] < 0 and last[track] not in current:
+                tracks[row], last[track] = track, row
         for row in current:
             if tracks[row] < 0:
                 tracks[row] = len(last)
-            last[int(tracks[row])] = int(row)
+                last[len(last)] = row
     return tracks

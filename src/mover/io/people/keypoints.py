@@ -6,7 +6,7 @@ image, with the body (BODY_25), and hands and face where detected.
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from mover.io.files.fields import FASTEST, LARGEST, SLOWEST, At, read_json
 from mover.io.files.npz import read_npz, write_npz
 from mover.io.formats import chosen
 from mover.io.people.found import Known, followed
-from mover.io.people.values import files_of, named, need, number_in, numbers, tensor
+from mover.io.people.values import files_of, frames_in, lone, named, need, numbers, tensor
 
 _NAMES = ("openpose25", "openpose137", "coco17", "halpe26", "mediapipe33")
 LAYOUTS = {name: len(JOINTS[name]) for name in _NAMES}
@@ -93,32 +93,26 @@ def read_instances(path: Path, known: Known, layout: str) -> Keypoints:
     if not isinstance(at.value, dict | list):
         at.refuse("a list of instances, or an object with 'annotations' or 'instance_info'")
     images = None if isinstance(at.value, list) else at.maybe("instance_info")
-    if images is not None:
-        listed: list[tuple[At, int]] = []
-        for index, image in enumerate(images.items()):
-            number = image.maybe("frame_id", "image_id")
-            frame = index if number is None else _integer(number)
-            listed += [(one, frame) for one in need(image, "instances").items()]
-    else:
+    if images is None:
         rows = at if isinstance(at.value, list) else need(at, "annotations", "instance_info")
+        listed = [(one, need(one, "image_id", "frame_id", "frame")) for one in rows.items()]
+    else:
         listed = [
-            (one, _integer(need(one, "image_id", "frame_id", "frame"))) for one in rows.items()
+            (one, image.maybe("frame_id", "image_id") or At(index, at.file))
+            for index, image in enumerate(images.items())
+            for one in need(image, "instances").items()
         ]
-    count = LAYOUTS[layout]
-    seen = [_instance(one, frame - known.first, count) for one, frame in listed]
+    seen: list[PersonJoints] = []
+    for one, frame in listed:
+        number = re.findall(r"\d+", Path(str(frame.value)).stem)
+        if isinstance(frame.value, bool) or not number:
+            frame.refuse("a number, or a name with one")
+        seen.append(_instance(one, int(number[-1]) - known.first, LAYOUTS[layout]))
     return keypoints_of(seen, layout, known.fps, path.name)
 
 
-def _integer(at: At) -> int:
-    """A whole number, or the last number in a name."""
-    found = re.findall(r"\d+", Path(str(at.value)).stem)
-    if isinstance(at.value, bool) or not found:
-        at.refuse("a number, or a name with one")
-    return int(found[-1])
-
-
 def _instance(at: At, frame: int, count: int) -> PersonJoints:
-    """One person of a list; a track that is no number from 0 is unknown."""
+    """One person of a list."""
     given, scores = need(at, "keypoints"), at.maybe("keypoint_scores", "scores")
     value = numbers(given)
     width = value.size // count if value.size % count == 0 else 0
@@ -132,42 +126,36 @@ def _instance(at: At, frame: int, count: int) -> PersonJoints:
         joints = np.concatenate([joints, sure.reshape(count, 1)], 1)
     if "num_keypoints" in at.mapping():  # ground truth: 0 absent, 1 hidden, 2 visible
         joints = np.where([True, True, False], joints, joints > 0)
+    return PersonJoints(frame, _track(at), joints)
+
+
+def _track(at: At) -> int:
+    """The track of a person; what is no number from 0 is unknown, -1."""
     found = at.maybe("track_id", "idx", "person_id")
-    track: Any = -1 if found is None else found.value
-    while isinstance(track, list):
-        track = track[0] if len(track) == 1 else -1  # pyright: ignore[reportUnknownVariableType]
-    known = isinstance(track, int | float) and not isinstance(track, bool) and track >= 0
-    return PersonJoints(frame, int(track) if known else -1, joints)
+    track = -1 if found is None else lone(found)
+    known = isinstance(track, int | float) and not isinstance(track, bool)
+    return int(track) if known and 0 <= track <= LARGEST else -1
 
 
 def read_openpose(path: Path, known: Known) -> Keypoints:
     """Keypoints of a folder of OpenPose JSON, or of one file."""
-    files = files_of(path, "*.json", "OpenPose's keypoints")
+    files = files_of(path, "OpenPose's keypoints", "*.json")
     seen: list[PersonJoints] = []
-    for index, file in enumerate(files):
-        name = file.stem.removesuffix("_keypoints")
-        frame = number_in(name, index) - known.first if path.is_dir() else 0
+    for file, frame in zip(files, frames_in(files, path, known), strict=True):
         for at in need(read_json(file), "people").items():
             need(at, "pose_keypoints_2d")
-            joints = np.concatenate([_part(at, name, count) for name, count in PARTS.items()])
-            given = at.maybe("person_id")
-            ids = [-1.0] if given is None else numbers(given).reshape(-1).tolist() or [-1.0]
-            seen.append(PersonJoints(frame, int(ids[0]), joints))
-    if any(one.joints[25:, 2].any() for one in seen):
-        return keypoints_of(seen, "openpose137", known.fps, path.name)
-    seen = [PersonJoints(one.frame, one.person, one.joints[:25]) for one in seen]
-    return keypoints_of(seen, "openpose25", known.fps, path.name)
-
-
-def _part(at: At, name: str, count: int) -> NDArray[np.float64]:
-    """The triples of a part; zeros where it is not given."""
-    given = at.maybe(name)
-    if given is None or not np.size(numbers(given)):
-        return np.zeros((count, 3))
-    value = numbers(given)
-    if value.size != count * 3:
-        given.refuse(f"{count} triples x, y, confidence", f"{value.size} numbers")
-    return value.reshape(count, 3)
+            joints: list[NDArray[np.float64]] = []
+            for name, count in PARTS.items():
+                value = numbers(at.maybe(name) or at.holding([]))
+                if value.size not in (0, count * 3):
+                    at.get(name).refuse(
+                        f"{count} triples x, y, confidence", f"{value.size} numbers"
+                    )
+                joints.append(value.reshape(-1, 3) if value.size else np.zeros((count, 3)))
+            seen.append(PersonJoints(frame, _track(at), np.concatenate(joints)))
+    layout = "openpose137" if any(one.joints[25:, 2].any() for one in seen) else "openpose25"
+    seen = [replace(one, joints=one.joints[: LAYOUTS[layout]]) for one in seen]
+    return keypoints_of(seen, layout, known.fps, path.name)
 
 
 def write_keypoints(keypoints: Keypoints, path: Path) -> None:

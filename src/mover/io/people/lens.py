@@ -5,7 +5,7 @@ the true one it keeps the pixel of its middle and its size in pixels.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -29,7 +29,7 @@ def lens(fx: float, fy: float, cx: float, cy: float) -> At:
 
 
 def assumed_lens(
-    known: Known, focal: Callable[[float, float], float], size: tuple[float, float] | None = None
+    known: Known, focal: Callable[[float, float], float], size: Sequence[float] | None = None
 ) -> At | None:
     """The lens that most tools assume: the principal point is the image's middle.
 
@@ -61,10 +61,10 @@ def from_weak(crop: Float[Tensor, "bodies 4"], camera: Camera) -> Float[Tensor, 
 
 def refocused(
     middle: Float[Tensor, "bodies 3"], used: Float[Tensor, "bodies 3 3"], K: Float[Tensor, "3 3"]
-) -> Float[Tensor, "bodies 3"] | None:
-    """Shift that keeps position and size in the image under another lens; None: it is the same."""
+) -> Float[Tensor, "bodies 3"]:
+    """Shift that keeps position and size in the image under another lens; 0 under the same."""
     if not (used - K).abs().amax() > SAME_LENS * K[0, 0]:
-        return None
+        return torch.zeros_like(middle)
     pixel = torch.einsum("bij,bj->bi", used, middle)
     pixel = pixel[:, :2] / pixel[:, 2:]
     f, f_used = K[[0, 1], [0, 1]], used[:, [0, 1], [0, 1]]
@@ -75,10 +75,8 @@ def refocused(
 def lens_of(points: Float[Tensor, "points 3"], pixels: Float[Tensor, "points 2"]) -> At:
     """The lens that sees these points in camera axes at these pixels, by least squares [px]."""
     rays = (points[:, :2] / points[:, 2:]).double()
-    one, none = torch.ones(len(rays)).double(), torch.zeros(len(rays)).double()
-    left = torch.cat(
-        [torch.stack([rays[:, 0], one, none], 1), torch.stack([rays[:, 1], none, one], 1)]
-    )
+    centre = torch.eye(2).double().repeat_interleave(len(rays), 0)  # first all x, then all y
+    left = torch.cat([rays.T.reshape(-1, 1), centre], 1)
     f, cx, cy = least_squares(left, pixels.double().T.flatten()).tolist()
     return lens(f, f, cx, cy)
 

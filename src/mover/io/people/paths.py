@@ -27,39 +27,31 @@ Array = NDArray[Any]
 def read_vipe(path: Path) -> At:
     """ViPE: pose/NAME.npz (`data`, `inds`), and intrinsics/NAME.npz beside it."""
     folder = path / "pose" if (path / "pose").is_dir() else path
-    file = v.only_file(folder, "*.npz", "ViPE's poses")
-    at = v.read_any(file)
-    T = v.stacked(need(at, "data"), 4, 4)
-    frame = v.whole(need(at, "inds"), len(T))
-    lens = file.parent.parent / "intrinsics" / file.name
-    focal = None
-    if lens.is_file():
-        given = need(v.read_any(lens), "data")
-        focal = v.rows(given, None, 4)
-        if len(focal) != len(T):
-            given.refuse(f"{len(T)} rows, as there are poses", f"{len(focal)}")
-        focal = focal[:, 0] / (2 * focal[:, 2])
-    return _arrays(at.file, T, frame, focal)
+    file = v.only_file(folder, "ViPE's poses", "*.npz")
+    at, lens = v.read_any(file), file.parent.parent / "intrinsics" / file.name
+    focal = _focal(need(v.read_any(lens), "data"), 4) if lens.is_file() else None
+    return _arrays(at.file, v.stacked(need(at, "data"), 4, 4), v.whole(need(at, "inds")), focal)
 
 
 def read_megasam(path: Path) -> At:
     """MegaSaM: NAME_sgd_cvd_hr.npz, or NAME_droid.npz of its first stage."""
-    at = v.read_any(v.only_file(path, "*_sgd_cvd_hr.npz", "MegaSaM's result"))
-    return _arrays(at.file, v.stacked(need(at, "cam_c2w"), 4, 4), focal=_focal(at))
+    at = v.read_one(path, "MegaSaM's result", "*_sgd_cvd_hr.npz")
+    T = v.stacked(need(at, "cam_c2w"), 4, 4)
+    return _arrays(at.file, T, focal=_focal(need(at, "intrinsic"), 9))
 
 
 def read_vggt(path: Path) -> At:
     """VGGT: predictions.npz with `extrinsic` (N, 3, 4), world to camera, and `intrinsic`."""
-    at = v.read_any(v.only_file(path, "*.npz", "VGGT's predictions"))
+    at = v.read_one(path, "VGGT's predictions", "*.npz")
     given = v.stacked(need(at, "extrinsic"), 3, 4)
     T = np.linalg.inv(affine(given[:, :, :3], given[:, :, 3]))
-    return _arrays(at.file, T, focal=_focal(at))
+    return _arrays(at.file, T, focal=_focal(need(at, "intrinsic"), 9))
 
 
-def _focal(at: At) -> Array:
-    """Focal lengths of matrices of intrinsics, in widths of the image."""
-    K = v.rows(need(at, "intrinsic"), None, 9, 3).reshape(-1, 9)
-    return K[:, 0] / (2 * K[:, 2])
+def _focal(at: At, count: int) -> Array:
+    """Focal lengths in widths of the image, of matrices (9 numbers) or of fx, fy, cx, cy (4)."""
+    lenses = v.stacked(at, count)
+    return lenses[:, 0] / (2 * lenses[:, 2])
 
 
 def read_slam(path: Path) -> At:
@@ -70,9 +62,8 @@ def read_slam(path: Path) -> At:
     Raises:
         InputError: If it has another shape, or no camera was followed.
     """
-    at = v.read_any(
-        v.only_file(path, "**/slam_results.p*t*", "slam_results.pth of WHAM or .pt of GVHMR")
-    )
+    what = "slam_results.pth of WHAM or .pt of GVHMR"
+    at = v.read_one(path, what, "**/slam_results.p*t*")
     value = v.numbers(at)
     if value.ndim == 3:
         return _arrays(at.file, np.linalg.inv(v.stacked(at, 4, 4)))
@@ -90,7 +81,7 @@ def read_tum(path: Path) -> At:
     Raises:
         InputError: If a line has another form, or the times are seconds.
     """
-    file = v.only_file(path, "*.txt", "a trajectory in TUM's format")
+    file = v.only_file(path, "a trajectory in TUM's format", "*.txt")
     table = _table([line for _, line in _lines(file)], file.name, 8)
     frame = table[:, 0]
     if (frame != np.round(frame)).any():
@@ -166,5 +157,5 @@ def _arrays(name: str, T: Array, frame: Array | None = None, focal: Array | None
     """The arrays of cameras.npz under the name of the tool's own file; by default of all frames."""
     found = {"frame": np.arange(len(T)) if frame is None else frame, "T_world_camera": T}
     if focal is not None:
-        found["focal"] = np.broadcast_to(focal, (len(T),)).copy()
+        found["focal"] = np.repeat(focal, len(T)) if len(focal) == 1 else focal
     return At(found, name)

@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -63,6 +63,8 @@ class Person:
     """The lens that the tool assumed, one or a row each [px]."""
     model: str = ""
     """The body model where the file decides, else empty."""
+    upright: At | None = None
+    """Angles of the root, or of all joints, in a world with +y up."""
     warnings: tuple[str, ...] = ()
 
 
@@ -78,6 +80,8 @@ class Tool:
     root: str = "global_orient"
     """The root and the body, where they are two fields."""
     body: str = "body_pose"
+    verts: str = ""
+    """Vertices about `translation`, in place of parameters."""
     shape: Names = ("betas",)
     widths: tuple[int, ...] = ()
     """Of the shape; empty: any."""
@@ -109,35 +113,54 @@ def read(path: Path, known: Known, tool: str) -> Found:
 
 def _rows(tool: Tool, person: Person, known: Known) -> Found:
     """The rows of one person."""
-    at, model = person.fields, person.model or tool.model
+    at, model, warnings = person.fields, person.model or tool.model, person.warnings
     frames = v.whole(need(at, *tool.frames)) if tool.frames else None
-    turns, extra = _turns(tool, at, model, None if frames is None else len(frames), known)
-    count = len(turns)
+    gender, rate = "neutral", at.maybe(*tool.rate)
+    if tool.verts:
+        verts = v.stacked(need(at, tool.verts), 3) + v.rows(need(at, tool.translation), 1, 3)
+        values = {"verts": v.tensor(verts)[None]}
+    else:
+        pose = _pose(tool, at, model, None if frames is None else len(frames), known)
+        values = {name: getattr(pose, name) for name in NEEDED} | pose.extra
+        gender = pose.gender
+        if person.upright is not None:
+            turns = v.angles(person.upright, len(pose.transl), 1, *JOINTS[model])
+            warnings += tilting(pose.global_orient, turns[:, :3])
+    count = len(next(iter(values.values())))
     if frames is None:
         frames = np.arange(person.frame, person.frame + count)
-    shape = at.maybe(*tool.shape) if tool.shapeless else need(at, *tool.shape)
-    betas = np.zeros((count, SHAPES)) if shape is None else v.rows(shape, count, *tool.widths)
-    given, rate = at.maybe(tool.translation), at.maybe(*tool.rate)
-    turn, shift = (at.maybe(name) for name in tool.camera) if tool.camera else (None, None)
-    if given is None and shift is None:
-        need(at, tool.translation, *tool.camera[1:])
-    place = np.zeros((count, 3)) if given is None else v.rows(given, count, 3)
-    pose = BodyPose(
-        model=model, gender=known.gender or _gender(at), betas=v.tensor(betas),
-        global_orient=turns[:, :3], body_pose=turns[:, 3 : 72 if model == "smpl" else 66],
-        transl=v.tensor(place), extra=extra,
-    )  # fmt: skip
-    if tool.camera:
-        R = np.eye(3).reshape(1, 9).repeat(count, 0) if turn is None else v.rows(turn, count, 9)
-        t = np.zeros((count, 3)) if shift is None else v.rows(shift, count, 3)
-        pose = moved(pose, v.tensor(R).reshape(-1, 3, 3), v.tensor(t))
-    values = {name: getattr(pose, name) for name in NEEDED} | dict(extra)
     values["frame"] = torch.from_numpy(frames)
-    values["person"] = torch.tensor([UNTRACKED if person.track is None else person.track] * count)
+    values["person"] = torch.full((count,), UNTRACKED if person.track is None else person.track)
     if person.K is not None:
         values["K"] = v.tensor(v.rows(person.K, count, 9)).reshape(-1, 3, 3)
     fps = None if rate is None else v.one_number(rate)
-    return Found(model, values, pose.gender, fps, tool.space, person.warnings)
+    return Found(model, values, gender, fps, tool.space, warnings)
+
+
+def _pose(tool: Tool, at: At, model: str, count: int | None, known: Known) -> BodyPose:
+    """The parameters of one person, in the camera or the upright world."""
+    turns, extra = _turns(tool, at, model, count, known)
+    need(at, tool.translation, *tool.camera[1:])
+    if not tool.shapeless:
+        need(at, *tool.shape)
+    gender, said = known.gender or "neutral", at.maybe("gender")
+    if known.gender is None and said is not None:
+        word = v.lone(said)
+        word = word.decode(errors="replace") if isinstance(word, bytes) else str(word)
+        gender = said.holding(word).choice(GENDERS)
+
+    def part(names: Names, missing: Tensor, *widths: int) -> Tensor:
+        if (given := at.maybe(*names)) is None:
+            return missing.expand(len(turns), -1)
+        return v.tensor(v.rows(given, len(turns), *widths))
+
+    pose = BodyPose(
+        model=model, gender=gender, betas=part(tool.shape, torch.zeros(SHAPES), *tool.widths),
+        global_orient=turns[:, :3], body_pose=turns[:, 3 : 72 if model == "smpl" else 66],
+        transl=part((tool.translation,), torch.zeros(3), 3), extra=extra,
+    )  # fmt: skip
+    R = part(tool.camera[:1], torch.eye(3).flatten(), 9).reshape(-1, 3, 3)
+    return moved(pose, R, part(tool.camera[1:], torch.zeros(3), 3))
 
 
 def _turns(
@@ -154,8 +177,7 @@ def _turns(
     body = need(at, tool.body)
     root = v.angles(need(at, tool.root), count, 1)
     count = len(root)
-    values = v.numbers(body)
-    if values.ndim and values.shape[-1] == CODE:
+    if v.numbers(body).shape[-1:] == (CODE,):
         turned = _decoded(body, count, known)
     else:
         turned = v.angles(body, count, 23, 21)[:, : 69 if model == "smpl" else 63]
@@ -176,65 +198,39 @@ def _decoded(at: At, count: int, known: Known) -> Tensor:
         return known.decode(v.tensor(v.rows(at, count)))
 
 
-def _gender(at: At) -> str:
-    given = at.maybe("gender")
-    if given is None:
-        return "neutral"
-    value: Any = given.value.tolist() if isinstance(given.value, np.ndarray) else given.value
-    while isinstance(value, list) and len(value) == 1:
-        value = value[0]
-    word = value.decode(errors="replace") if isinstance(value, bytes) else str(value)
-    if word not in GENDERS:
-        given.refuse("one of " + ", ".join(GENDERS))
-    return word
-
-
-def _in_folder(path: Path, *names: str) -> At:
-    """The file itself, or the first of these that a folder has."""
-    inside = (path / name for name in names if (path / name).is_file())
-    return v.read_any(next(inside, path / names[0]) if path.is_dir() else path)
-
-
 def gvhmr(path: Path, _: Known) -> Iterator[Person]:
     """hmr4d_results.pt of GVHMR, smpl_params.pt of GEM: one person in all frames."""
-    at = _in_folder(path, "hmr4d_results.pt", "smpl_params.pt")
+    at = v.read_one(path, "GVHMR's or GEM's results", "hmr4d_results.pt", "smpl_params.pt")
     body = need(at, "smpl_params_incam", "body_params_incam")
     world = at.maybe("smpl_params_global", "body_params_global")
-    warnings: tuple[str, ...] = ()
-    if world is not None:
-        root = v.angles(need(body, "global_orient"), None, 1)
-        warnings = tilting(root, v.angles(need(world, "global_orient"), len(root), 1))
-    yield Person(body, K=at.maybe("K_fullimg"), warnings=warnings)
+    root = None if world is None else need(world, "global_orient")
+    yield Person(body, K=at.maybe("K_fullimg"), upright=root)
 
 
 def wham(path: Path, known: Known) -> Iterator[Person]:
     """wham_output.pkl: people by their tracks."""
-    for track, at in v.people_of(_in_folder(path, "wham_output.pkl")):
-        world, warnings = at.maybe("pose_world"), ()
-        if world is not None:
-            root = v.angles(need(at, "pose"), None, 24)[:, :3]
-            warnings = tilting(root, v.angles(world, len(root), 24)[:, :3])
-        yield Person(at, track, K=assumed_lens(known, math.hypot), warnings=warnings)
+    K = assumed_lens(known, math.hypot)
+    for track, at in v.people_of(v.read_one(path, "WHAM's results", "wham_output.pkl")):
+        yield Person(at, track, K=K, upright=at.maybe("pose_world"))
 
 
 def prompthmr(path: Path, _: Known) -> Iterator[Person]:
     """results.pkl: `people`, and the cameras beside them."""
-    source = _in_folder(path, "results.pkl")
+    source = v.read_one(path, "PromptHMR's results", "results.pkl")
     camera, world = source.maybe("camera", "camera_world"), source.maybe("camera_world")
     K, warnings = None if camera is None else _image_lens(camera), ()
     if world is not None:
         R = v.stacked(need(world, "Rcw"), 3, 3)
         warnings = movement(R, v.rows(need(world, "Tcw"), len(R), 3))
     for track, one in v.people_of(need(source, "people")):
-        body = need(one, "smplx_cam")
-        fields = {**body.mapping(), "frames": need(one, "frames").value}
-        yield Person(body.holding(fields), track, K=K, warnings=warnings)
+        body = v.with_fields(need(one, "smplx_cam"), frames=need(one, "frames").value)
+        yield Person(body, track, K=K, warnings=warnings)
 
 
 def tram(path: Path, _: Known) -> Iterator[Person]:
     """A folder with camera.npy and hps/hps_track_<k>.npy."""
-    tracks = v.files_of(path, "hps/hps_track_*.npy", "TRAM's results")
-    file = (path if path.is_dir() else path.parent.parent) / "camera.npy"
+    tracks = v.files_of(path, "TRAM's results", "hps/hps_track_*.npy")
+    file = tracks[0].parent.parent / "camera.npy"
     lens_of_all, warnings = None, ()
     if file.is_file():
         source = v.read_any(file)
@@ -261,22 +257,18 @@ def pare(path: Path, known: Known) -> Iterator[Person]:
     """
     if known.camera is None:
         raise InputError(f"{path.name}: PARE knows no lens: --camera names a camera.json")
-    names = ("pare_output.pkl", "vibe_output.pkl")
-    videos = [path / name for name in names if (path / name).is_file()]
-    files = videos[:1] or v.files_of(path, "*.pkl", "PARE's results")
-    for k, file in enumerate(files):
+    files = v.files_of(path, "PARE's results", "pare_output.pkl", "vibe_output.pkl", "*.pkl")
+    for file, frame in zip(files, v.frames_in(files, path, known), strict=True):
         at, people = v.read_any(file), list[tuple[int | None, At]]()
         if at.maybe("orig_cam", "pred_pose") is None:  # of a video: people by track
             people += v.people_of(at)
         else:
             count = len(v.rows(need(at, "orig_cam"), None, 4))
-            frame = v.number_in(file.stem, k) - known.first if path.is_dir() else 0
-            fields = {**at.mapping(), "frame_ids": np.full(count, frame)}
-            people.append((None, At(fields, at.file)))
+            people.append((None, v.with_fields(at, frame_ids=np.full(count, frame))))
         for track, one in people:
             crop = torch.from_numpy(v.rows(need(one, "orig_cam"), None, 4).copy())
-            fields = {**one.mapping(), "transl": from_weak(crop, known.camera).numpy()}
-            yield Person(one.holding(fields), track)
+            place = from_weak(crop, known.camera).numpy()
+            yield Person(v.with_fields(one, transl=place), track)
 
 
 def phalp(path: Path, known: Known) -> Iterator[Person]:
@@ -285,30 +277,25 @@ def phalp(path: Path, known: Known) -> Iterator[Person]:
     People who are only predicted in a frame, not detected, are left out. Bodies were seen in crops
     of 256 px at 5000 px, the image padded to a square.
     """
-    source = v.read_any(v.only_file(path, "**/*.pkl", "the results of PHALP"))
-    frames = source.mapping()
-    for index, name in enumerate(sorted(frames, key=lambda key: v.natural(Path(str(key))))):
-        at = At(frames[name], source.file, str(name))
-        camera = need(at, "camera")
+    source = v.read_one(path, "the results of PHALP", "**/*.pkl")
+    for index, name in enumerate(sorted(source.mapping(), key=lambda key: v.natural(Path(key)))):
+        at = source.get(name)
+        bodies, tracks = need(at, "smpl").items(), v.whole(need(at, "tid")).tolist()
+        camera, ages = need(at, "camera"), at.maybe("tracked_time")
         listed = list(camera.value) if isinstance(camera.value, np.ndarray) else camera.value
-        bodies, cameras = need(at, "smpl").items(), camera.holding(listed).items()
-        tracks = v.whole(need(at, "tid"))
-        ages, sizes = at.maybe("tracked_time"), at.maybe("size")
+        cameras = camera.holding(listed).items()
         if not len(bodies) == len(cameras) == len(tracks):
             n = f"{len(tracks)} tracks, {len(bodies)} bodies and {len(cameras)} cameras"
             raise InputError(f"{at.place} has {n}, expected as many of each")
         age = np.zeros(len(tracks)) if ages is None else v.numbers(ages).reshape(-1)
-        size = None
-        if sizes is not None and len(tracks):
-            height, width = v.stacked(sizes, 2)[0].tolist()
-            size = width, height
+        sizes, time = at.maybe("size"), at.maybe("time")
+        size = v.stacked(sizes, 2)[0, ::-1].tolist() if sizes is not None and tracks else None
         K = assumed_lens(known, lambda *sides: FOCAL / CROP * max(sides), size)
-        time = at.maybe("time")
         frame = index if time is None or v.one_number(time) < 0 else int(v.one_number(time))
-        for k in range(len(tracks)):
+        for k, track in enumerate(tracks):
             if len(age) != len(tracks) or age[k] == 0:
                 body = at.holding({**bodies[k].mapping(), "camera": cameras[k].value})
-                yield Person(body, int(tracks[k]), frame, K=K)
+                yield Person(body, track, frame, K=K)
 
 
 def slahmr(path: Path, _: Known) -> Iterator[Person]:
@@ -319,24 +306,21 @@ def slahmr(path: Path, _: Known) -> Iterator[Person]:
     Raises:
         InputError: If it is the prior's file, or another.
     """
-    path = v.files_of(path, "**/*_world_results.npz", "SLAHMR's results")[-1]
+    path = v.files_of(path, "SLAHMR's results", "**/*_world_results.npz")[-1]
     source = v.read_any(path)
     if "prior_results" in path.name and source.maybe("trans") is None:
         raise InputError(
             f"{path.name}: is SLAHMR's motion prior, without positions; expected the file "
             "*_world_results.npz of the same number beside it"
         )
-    shape = v.numbers(need(source, "trans")).shape
-    if len(shape) != 3 or 0 in shape:
-        raise InputError(f"{source.file}: field 'trans' has shape {shape}, expected (B, T, 3)")
-    people, count = shape[:2]
-    betas, fields = v.rows(need(source, "betas"), people), dict[str, NDArray[np.float64]]()
-    for name in ("trans", "root_orient", "pose_body", "cam_R", "cam_t"):
-        given = need(source, name)
-        fields[name] = v.numbers(given)
-        if fields[name].shape[:2] != (people, count):
-            given.refuse(f"({people}, {count}, n) numbers", f"shape {fields[name].shape}")
-    intrins = source.maybe("intrins")
+    names = ("trans", "root_orient", "pose_body", "cam_R", "cam_t")
+    fields = {name: v.numbers(need(source, name)) for name in names}
+    for name, value in fields.items():
+        if value.ndim < 3 or not value.size or value.shape[:2] != fields["trans"].shape[:2]:
+            wanted = "(people, frames, n) numbers, as many as of 'trans'"
+            source.get(name).refuse(wanted, f"shape {value.shape}")
+    people, count = fields["trans"].shape[:2]
+    betas, intrins = v.rows(need(source, "betas"), people), source.maybe("intrins")
     K = None if intrins is None else lens(*v.stacked(intrins, 4)[0].tolist())
     whole = [(who, who, np.arange(count)) for who in range(people)]
     for track, who, frames in [*_visible(path, count, people)] or whole:
@@ -359,21 +343,13 @@ def _visible(path: Path, count: int, people: int) -> Iterator[tuple[int, int, ND
 
 def prox(path: Path, known: Known) -> Iterator[Person]:
     """results/<frame>/<person>.pkl or <frame>.pkl of SMPLify-X and PROX, or one such file."""
-    files = v.files_of(path, "**/*.pkl", "fits")
-    names: list[str] = []
-    for file in files:
-        inside = re.fullmatch(r"\d{1,3}", file.stem) and re.search(r"\d", file.parent.name)
-        names.append(file.parent.name if inside else file.stem)
-    frames = known.frames
-    if not path.is_dir():
-        names, frames = [path.name], {path.name: 0}
-    elif frames is None:
-        numbered = v.frame_numbers(names, path.name)
-        frames = {name: number - known.first for name, number in numbered.items()}
-    for file, name in zip(files, names, strict=True):
-        if name not in frames:
-            raise InputError(f"{file}: {name!r} is no frame of the recording")
-        yield Person(v.read_any(file), None, frames[name])
+    files = v.files_of(path, "fits", "**/*.pkl")
+    images = [
+        file.parent if re.fullmatch(r"\d{1,3}", file.stem) and re.search(r"\d", file.parent.name)
+        else file for file in files
+    ]  # fmt: skip
+    for file, frame in zip(files, v.frames_in(images, path, known), strict=True):
+        yield Person(v.read_any(file), None, frame)
 
 
 def smplifyx(path: Path, known: Known) -> Iterator[Person]:
@@ -384,98 +360,84 @@ def smplifyx(path: Path, known: Known) -> Iterator[Person]:
 
 def amass(path: Path, _: Known) -> Iterator[Person]:
     """Motions of AMASS: one npz a person."""
-    for track, file in enumerate(v.files_of(path, "*.npz", "motions of AMASS")):
-        at = v.read_any(file)
+    for track, file in enumerate(v.files_of(path, "motions of AMASS", "*.npz")):
+        at = v.with_fields(v.read_any(file), turn=Y_UP)
         count = len(v.stacked(need(at, "trans"), 3))
         if at.maybe("poses") is None and at.maybe("pose_body") is not None:
             given = [(at.maybe(name), width) for name, width in AMASS_PARTS.items()]
             rows = [np.zeros((count, n)) if x is None else v.rows(x, count, n) for x, n in given]
-            at = at.holding({**at.mapping(), "poses": np.concatenate(rows, 1)})
+            at = v.with_fields(at, poses=np.concatenate(rows, 1))
         width = v.rows(need(at, "poses"), count).shape[1]
         if width not in AMASS:
             need(at, "poses").refuse(f"rows of {' or '.join(map(str, AMASS))} angles")
-        at = at.holding({**at.mapping(), "turn": Y_UP, "shift": np.zeros(3)})
         yield Person(at, track, model=AMASS[width], warnings=(NO_CAMERA,))
 
 
-def read_sam3dbody(path: Path, known: Known) -> Found:
+def sam3dbody(path: Path, known: Known) -> Iterator[Person]:
     """Meshes of MHR: a file a person (`<image>_subj00.npz`), or a file with a list of people.
 
     Names that end in `_subj00` or `_person1` are people of the image before; the last number of
     what is left is the frame. The vertices lie about the origin of the body, whose camera_t is
     added [m].
     """
-    files, images = [path], [path.stem]
-    if path.is_dir():
-        files = sorted((f for f in path.iterdir() if f.suffix.lower() in v.KINDS), key=v.natural)
-        images = [re.sub(r"_?(?:subj|person|human)_?\d+$", "", file.stem) for file in files]
-    if not files:
-        raise InputError(f"{path}: has no files of kind {', '.join(v.KINDS)}")
-    numbered = v.frame_numbers(images, path.name) if path.is_dir() else {path.stem: known.first}
-    seen: list[tuple[int, At]] = []
-    for file, image in zip(files, images, strict=True):
+    kinds = "a file for each person or image", *(f"*{kind}" for kind in v.KINDS)
+    files = v.files_of(path, *kinds)
+    images = [f.with_stem(re.sub(r"_?(?:subj|person|human)_?\d+$", "", f.stem)) for f in files]
+    for file, frame in zip(files, v.frames_in(images, path, known), strict=True):
         at = v.read_any(file)
-        people = at.value.tolist() if isinstance(at.value, np.ndarray) else at.value
-        listed = [at] if isinstance(people, Mapping) else At(people, at.file).items()
-        seen += [(numbered[image] - known.first, one) for one in listed]
-    if not seen:
-        raise InputError(f"{path}: has no people, expected at least one")
-    return joined([_mesh(at, frame, known) for frame, at in seen])
+        for one in [at] if isinstance(at.value, Mapping) else at.items():
+            yield Person(one, None, frame, K=_lens_of_joints(one, known))
 
 
-def _mesh(at: At, frame: int, known: Known) -> Found:
-    """One person, under the lens of joints in space and in the image, else the focal length."""
-    place = v.rows(need(at, "pred_cam_t"), 1, 3)
-    verts = v.tensor(v.stacked(need(at, "pred_vertices"), 3) + place)
-    joints, pixels = at.maybe("pred_keypoints_3d"), at.maybe("pred_keypoints_2d")
-    focal = at.maybe("focal_length")
+def _lens_of_joints(at: At, known: Known) -> At | None:
+    """The lens of joints in space and in the image, else that of the focal length."""
+    place, focal = v.rows(need(at, "pred_cam_t"), 1, 3), at.maybe("focal_length")
     f = known.focal if focal is None else v.one_number(focal)
-    assumed = dataclasses.replace(known, focal=f)
-    given = None if f is None else assumed_lens(assumed, lambda *_: f)
+    joints, pixels = at.maybe("pred_keypoints_3d"), at.maybe("pred_keypoints_2d")
     if joints is not None and pixels is not None:
         points = v.stacked(joints, 3) + place
         image = v.rows(pixels, len(points), 2)
         if np.isfinite(points).all() and np.isfinite(image).all():
-            given = lens_of(v.tensor(points), v.tensor(image))
-    values = {"frame": torch.tensor([frame]), "person": torch.tensor([UNTRACKED])}
-    values["verts"] = verts[None]
-    if given is not None:
-        values["K"] = v.tensor(given.value).reshape(1, 3, 3)
-    return Found("mhr", values)
+            return lens_of(v.tensor(points), v.tensor(image))
+    return None if f is None else assumed_lens(dataclasses.replace(known, focal=f), lambda *_: f)
 
 
 CROPS = Tool(
     pare, "smpl", pose=("pose", "pred_pose"), shape=("betas", "pred_shape"), widths=(10,),
     frames=("frame_ids",),
 )  # fmt: skip
+GVHMR = Tool(gvhmr, "smplx", shapeless=True)
 HMR2 = Tool(phalp, "smpl", widths=(10,), translation="camera")
+FITTED = "camera_rotation", "camera_translation"
 TOOLS = {
     "4dhumans": HMR2,
     "amass": Tool(
-        amass, "smplx", pose=("poses",), translation="trans", camera=("turn", "shift"),
+        amass, "smplx", pose=("poses",), translation="trans", camera=("turn",),
         rate=("mocap_frame_rate", "mocap_framerate"), space="world",
     ),
-    "gem": Tool(gvhmr, "smplx", shapeless=True),
-    "gvhmr": Tool(gvhmr, "smplx", shapeless=True),
+    "gem": GVHMR,
+    "gvhmr": GVHMR,
     "pare": CROPS,
     "phalp": HMR2,
     "prompthmr": Tool(
         prompthmr, "smplx", pose=("rotmat",), shape=("shape",), widths=(10, 11, 16),
         translation="trans", frames=("frames",),
     ),
-    "prox": Tool(prox, "smplx", camera=("camera_rotation", "camera_translation")),
+    "prox": Tool(prox, "smplx", camera=FITTED),
+    "sam3dbody": Tool(sam3dbody, "mhr", verts="pred_vertices", translation="pred_cam_t"),
     "slahmr": Tool(
         slahmr, "smplh", root="root_orient", body="pose_body", translation="trans",
         camera=("cam_R", "cam_t"), frames=("frames",),
     ),
-    "smplifyx": Tool(smplifyx, "smplx", camera=("camera_rotation", "camera_translation")),
+    "smplifyx": Tool(smplifyx, "smplx", camera=FITTED),
     "tram": Tool(
         tram, "smpl", pose=("pred_rotmat",), shape=("pred_shape",), widths=(10,),
         translation="pred_trans", frames=("frame",),
     ),
     "vibe": CROPS,
     "wham": Tool(
-        wham, "smpl", pose=("pose",), widths=(10,), translation="trans", frames=("frame_ids",),
+        wham, "smpl", pose=("pose",), widths=(10,), translation="trans",
+        frames=("frame_ids",),
     ),
 }  # fmt: skip
 """The tools by name; `mover.io.formats` lists them."""

@@ -2,7 +2,8 @@
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mover.core.errors import InputError
-from mover.core.files import unreadable
 from mover.core.pickles import load_plain
 from mover.core.records import BROKEN
 from mover.io.files.fields import LARGEST, LAST_INDEX, At, existing, read_json
 from mover.io.files.npz import AMASS, is_amass, read_npz
+from mover.io.people.found import Known
 
 PICKLES = (".pkl", ".pickle", ".joblib", ".pt", ".pth")
 TREES = {".npz": read_npz, ".json": read_json}
@@ -38,31 +39,37 @@ def read_any(path: Path) -> At:
         raise InputError(f"{path.name}: is no file of kind {', '.join(KINDS)}")
     if kind in TREES:
         return TREES[kind](path)
-    if kind in PICKLES:
-        return At(load_plain(path), path.name)
-    try:
-        with path.open("rb") as file:
-            return At(np.load(file, allow_pickle=False), path.name)
-    except ValueError:  # a pickled object
-        return At(load_plain(path), path.name)
-    except BROKEN as error:
-        raise unreadable(path, error, "an .npy file") from error
+    with suppress(*BROKEN):  # a pickled object
+        if kind == ".npy":
+            return At(np.load(path, allow_pickle=False), path.name)
+    return At(load_plain(path), path.name)
 
 
-def files_of(path: Path, pattern: str, what: str) -> list[Path]:
-    """The file itself, or the files of a folder, 2 before 10."""
-    files = sorted(path.glob(pattern), key=natural) if path.is_dir() else [path]
-    if not files:
-        raise InputError(f"{path}: has no {pattern.removeprefix('**/')}, expected {what}")
-    return files
+def files_of(path: Path, what: str, *patterns: str) -> list[Path]:
+    """The file itself, or those of a folder that fit the first pattern that any fits, 2 before 10.
+
+    Raises:
+        InputError: If a folder has none, `what` was expected.
+    """
+    if not path.is_dir():
+        return [path]
+    for pattern in patterns:
+        if files := sorted(path.glob(pattern), key=natural):
+            return files
+    raise InputError(f"{path}: has no {' or '.join(patterns).replace('**/', '')}, expected {what}")
 
 
-def only_file(path: Path, pattern: str, what: str) -> Path:
+def only_file(path: Path, what: str, *patterns: str) -> Path:
     """The file itself, or the only one of a folder."""
-    files = files_of(path, pattern, what)
+    files = files_of(path, what, *patterns)
     if len(files) > 1:
-        raise InputError(f"{path}: has {len(files)} files {pattern}, expected one: name it")
+        raise InputError(f"{path}: has {len(files)} files {patterns[0]}, expected one: name it")
     return files[0]
+
+
+def read_one(path: Path, what: str, *patterns: str) -> At:
+    """The content of the file itself, or of the only one of a folder."""
+    return read_any(only_file(path, what, *patterns))
 
 
 def number_in(name: str, index: int) -> int:
@@ -88,15 +95,31 @@ def frame_numbers(names: Iterable[str], place: str) -> dict[str, int]:
     shots = {found[1] for name in known if (found := re.match(r"s(\d+)_frame", name))}
     if len(shots) > 1:
         return {name: rank for rank, name in enumerate(known, 1)}
-    frames: dict[str, int] = {}
-    owners: dict[int, str] = {}
+    frames, owners = dict[str, int](), dict[int, str]()
     for rank, name in enumerate(known):
         named = re.findall(r"frame_?(\d+)", name)
-        number = number_in(named[-1] if named else name, rank)
-        if number in owners:
+        frames[name] = number = number_in(named[-1] if named else name, rank)
+        if owners.setdefault(number, name) != name:
             raise InputError(f"{place}: {owners[number]} and {name} are both frame {number}")
-        frames[name], owners[number] = number, name
     return frames
+
+
+def frames_in(images: Sequence[Path], path: Path, known: Known) -> list[int]:
+    """Frames by the names of the files or folders of images below `path`; one file is frame 0.
+
+    Raises:
+        InputError: If two names would be one frame, or one is none of the frames that are known.
+    """
+    if not path.is_dir():
+        return [0 for _ in images]
+    names = [image.stem if image.suffix in KINDS else image.name for image in images]
+    frames = known.frames
+    if frames is None:
+        numbered = frame_numbers(names, path.name)
+        frames = {name: number - known.first for name, number in numbered.items()}
+    if unknown := [image for image, name in zip(images, names, strict=True) if name not in frames]:
+        raise InputError(f"{unknown[0]}: is no frame of the recording")
+    return [frames[name] for name in names]
 
 
 def natural(path: Path) -> tuple[tuple[int, str], ...]:
@@ -122,19 +145,29 @@ def need(at: At, *names: str) -> At:
 
 def people_of(at: At) -> list[tuple[int, At]]:
     """The people of a mapping from track to person, numbered by their keys or in order."""
-    given = at.mapping()
-    if not given:
+    keys = list(at.mapping())
+    if not keys:
         raise InputError(f"{at.place} has no people, expected at least one track")
-    keys = [str(key) for key in given]
     tracks = [number_in(key, index) for index, key in enumerate(keys)]  # 17 of 17, of person_17
-    tracks = tracks if len(set(tracks)) == len(keys) else list(range(len(keys)))
-    people: list[tuple[int, At]] = []
-    for track, key, value in zip(tracks, keys, given.values(), strict=True):
-        person = At(value, at.file, f"{at.field}.{key}" if at.field else key)
-        if not isinstance(value, Mapping):
+    tracks = tracks if len(set(tracks)) == len(keys) else range(len(keys))
+    people = [(track, at.get(key)) for track, key in zip(tracks, keys, strict=True)]
+    for _, person in people:
+        if not isinstance(person.value, Mapping):
             person.refuse("the fields of a person under the number of a track")
-        people.append((track, person))
     return people
+
+
+def with_fields(at: At, **more: Any) -> At:  # noqa: ANN401
+    """A mapping with more fields."""
+    return at.holding({**at.mapping(), **more})
+
+
+def lone(at: At) -> Any:  # noqa: ANN401
+    """The value itself, taken out of arrays and lists of one."""
+    value: Any = at.value.tolist() if isinstance(at.value, np.ndarray) else at.value
+    while isinstance(value, list) and len(value) == 1:
+        value = value[0]
+    return value
 
 
 def numbers(at: At) -> NDArray[np.float64]:
@@ -156,9 +189,7 @@ def rows(at: At, count: int | None, *widths: int) -> NDArray[np.float64]:
     value = numbers(at)
     if value.ndim > 2 and len(value) == 1 and count not in (None, 1):
         value = value[0]  # a batch of one
-    if (value.ndim == 1 and (value.size in widths or not widths)) or (
-        value.size in widths and count == 1
-    ):
+    if (value.ndim == 1 and not widths) or (value.size in widths and 1 in (value.ndim, count)):
         value = value.reshape(1, -1)
     flat = value.reshape(len(value), -1) if value.size and value.ndim else np.zeros((0, 0))
     fits = flat.size > 0 and (flat.shape[1] in widths or not widths)
@@ -186,13 +217,11 @@ def one_number(at: At) -> float:
     return value
 
 
-def whole(at: At, count: int | None = None) -> NDArray[np.int64]:
+def whole(at: At) -> NDArray[np.int64]:
     """Whole numbers along one axis."""
     value = numbers(at).reshape(-1)
     if not (np.abs(value) <= LAST_INDEX).all() or (value != np.round(value)).any():
         at.refuse(f"whole numbers up to {LAST_INDEX}")
-    if count is not None and len(value) != count:
-        at.refuse(f"{count} whole numbers", f"{len(value)}")
     return value.astype(np.int64)
 
 

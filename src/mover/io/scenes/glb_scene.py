@@ -74,15 +74,19 @@ def up_axes(up: str) -> Matrix:
 
 
 def _nodes(scene: Any) -> list[str]:  # noqa: ANN401
-    """The nodes that are objects: the highest ones that are not mere groups, in order."""
-    children: dict[str, list[str]] = scene.graph.transforms.children
-    full = {node for leaf in scene.graph.nodes_geometry for node in _up(scene, leaf)}
+    """The nodes that are objects: the highest ones that are not mere groups, in order.
+
+    A group has no mesh, and several nodes below it have places of their own.
+    """
+    tree, leaves = scene.graph.transforms, {*scene.graph.nodes_geometry}
 
     def walk(node: str) -> Iterator[str]:
-        below = [child for child in children.get(node, []) if child in full]
         if node.startswith("body_") or node.rstrip("_") in OURS:
             return
-        if node == scene.graph.base_frame or _is_group(scene, node, below):
+        below = [child for child in tree.children.get(node, []) if leaves & tree.successors(child)]
+        places = [np.asarray(tree.edge_data[node, c].get("matrix", np.eye(4))) for c in below]
+        moved = sum(bool(np.abs(place - np.eye(4)).max() > NO_ROOM) for place in places)
+        if node == scene.graph.base_frame or (moved > 1 and scene.graph[node][1] is None):
             for child in below:
                 yield from walk(child)
         else:
@@ -91,35 +95,16 @@ def _nodes(scene: Any) -> list[str]:  # noqa: ANN401
     return sorted(walk(scene.graph.base_frame), key=lambda node: natural(Path(node)))
 
 
-def _up(scene: Any, leaf: str) -> Iterator[str]:  # noqa: ANN401
-    """A node and all above it."""
-    parents: dict[str, str] = scene.graph.transforms.parents
-    node: str | None = leaf
-    while node is not None:
-        yield node
-        node = parents.get(node)
-
-
-def _is_group(scene: Any, node: str, below: list[str]) -> bool:  # noqa: ANN401
-    """A node without mesh above several that have places of their own."""
-    edges = scene.graph.transforms.edge_data
-    _, geometry = scene.graph[node]
-    places = [np.asarray(edges[(node, c)].get("matrix", np.eye(4))) for c in below]
-    moved = [bool(np.abs(p - np.eye(4)).max() > NO_ROOM) for p in places]
-    return geometry is None and len(below) > 1 and sum(moved) > 1
-
-
 def _below(scene: Any, node: str) -> Any:  # noqa: ANN401
     """The meshes at and below a node, in its own axes."""
     import trimesh
 
     out = trimesh.Scene()
     back = np.linalg.pinv(np.asarray(scene.graph[node][0]))
-    for leaf in sorted(scene.graph.nodes_geometry):
-        if node in set(_up(scene, leaf)):
-            matrix, geometry = scene.graph[leaf]
-            transform = np.eye(4) if leaf == node else back @ np.asarray(matrix)
-            out.add_geometry(scene.geometry[geometry], node_name=leaf, transform=transform)
+    for leaf in sorted(scene.graph.transforms.successors(node) & {*scene.graph.nodes_geometry}):
+        matrix, geometry = scene.graph[leaf]
+        transform = np.eye(4) if leaf == node else back @ np.asarray(matrix)
+        out.add_geometry(scene.geometry[geometry], node_name=leaf, transform=transform)
     return out
 
 

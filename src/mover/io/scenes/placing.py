@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
 from mover.core.types import Mesh
+from mover.geometry.camera import pitch_roll, tilted
 from mover.geometry.rotations import affine
 from mover.io.capture.parts import UNKNOWN, Parts
 from mover.io.capture.scene_file import scene_tree
@@ -120,12 +122,8 @@ def _fields(t: Matrix, yaw: float, scale: Matrix) -> dict[str, Any]:
 
 def level_of(up_cam: Matrix) -> Matrix:
     """R_cam_world of a camera that sees gravity so: `up_cam` points up in its axes."""
-    up = up_cam / np.linalg.norm(up_cam)
-    ahead = np.array([0.0, 0, 1]) - up * up[2]
-    back = -ahead / max(float(np.linalg.norm(ahead)), 1e-9)
-    out: Matrix = np.empty((3, 3))
-    out[:, 0], out[:, 1], out[:, 2] = np.cross(up, back), up, back
-    return out
+    up = torch.from_numpy(up_cam / np.linalg.norm(up_cam))
+    return tilted(*pitch_roll(torch.stack([up, up, up], 1))).numpy()
 
 
 def write_parts(scene: Any, matrix: Matrix, path: Path) -> tuple[Mesh, str]:  # noqa: ANN401

@@ -23,7 +23,7 @@ from mover.io.files.images import image_size
 from mover.io.files.looks import is_cloud, load_parts, looks_lost
 from mover.io.files.meshes import KINDS
 from mover.io.files.schema import rotation
-from mover.io.people.values import TREES
+from mover.io.people.values import TREES, numbers
 from mover.io.scenes.placing import LEVEL, MOST_TILT, Matrix, Pieces, category_of_name, level_of
 
 TO_LOCAL = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
@@ -76,7 +76,7 @@ def _things(folder: Path) -> tuple[list[Path], list[str]]:
     paths.sort(key=lambda p: (length[p], p.stem, kinds[p.suffix.lower()]))
     clouds = [path for path in paths if is_cloud(path)]
     meshes = [path for path in paths if path not in clouds]
-    once = [p for k, p in enumerate(meshes) if p.stem not in [other.stem for other in meshes[:k]]]
+    once = {path.stem: path for path in reversed(meshes)}  # the first of each name
     if not once:
         found = f"{len(clouds)} files of points or splats, " if clouds else ""
         wanted = "expected <name>.glb with <name>.npz or .json"
@@ -85,11 +85,11 @@ def _things(folder: Path) -> tuple[list[Path], list[str]]:
         f"{listed('file', [p.name for p in passed])} {why}: passed over"
         for passed, why in (
             (clouds, "of points without faces, as Gaussian splats are"),
-            ([p for p in meshes if p not in once], "of the name of another mesh"),
+            ([p for p in meshes if p != once[p.stem]], "of the name of another mesh"),
         )
         if passed
     ]
-    return once, notes
+    return [p for p in meshes if p == once[p.stem]], notes
 
 
 def _pose_beside(path: Path) -> At:
@@ -124,11 +124,7 @@ def pose_matrix(at: At) -> Matrix:
 
 def _numbers(at: At, count: int) -> Matrix:
     """`count` numbers in any nesting."""
-    try:
-        value = np.asarray(at.value, dtype=np.float64).reshape(-1)
-    except (ValueError, TypeError):
-        return at.refuse(f"{count} numbers")
-    return at.holding(value).array((count,))
+    return at.holding(numbers(at).reshape(-1)).array((count,))
 
 
 def _attitude(camera: At | None, matrices: Sequence[Matrix]) -> tuple[Matrix, str]:
