@@ -41,7 +41,10 @@ def light(name, steps=15):
             config.layout, method=replace(config.layout.method, steps=steps),
             short=replace(config.layout.short, steps=min(5, config.layout.short.steps)),
         ),
-        refine=replace(config.refine, method=replace(config.refine.method, steps=5)),
+        refine=replace(
+            config.refine, method=replace(config.refine.method, steps=5),
+            rounds=min(2, config.refine.rounds),
+        ),
         gather=replace(config.gather, cells=48),
         place=replace(config.place, method=replace(config.place.method, steps=steps)),
     )  # fmt: skip

@@ -152,7 +152,7 @@ ROBUST = Config(
         num_hypotheses=6, coarse=2, wall_alignment_steps=2,
         yaw_prior_weight=1.0,
     ),
-    refine=RefineConfig(rounds=2),
+    refine=RefineConfig(rounds=8),
     sizes=SpreadConfig(0.05),
     gather=GatherConfig(erode=1, reach=0.1, cells=128),
     assign=_GROUPS,

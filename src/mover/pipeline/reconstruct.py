@@ -54,8 +54,7 @@ def from_image_and_people(
     camera, ground = people.alignment.camera, people.alignment.ground
     placed = steps.place_by_image(setup, camera, ground)  # L_scene: the image alone
     setup = steps.with_learnt_sizes(setup, placed)
-    for _ in range(config.refine.rounds):
-        placed = steps.refine_camera_and_objects(setup, people, placed)  # robust
+    placed = steps.refine_camera_and_objects(setup, people, placed)  # robust
     fit = steps.image_fit(setup, placed)
     people, placed = steps.estimate_scale(setup, people, placed)  # robust: one scale for all
     humans = steps.gather_humans(setup, people, placed)  # depth range, free space, contacts

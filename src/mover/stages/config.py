@@ -171,7 +171,7 @@ class RefineConfig:
     """How the camera is refined."""
 
     rounds: Annotated[int, int_in(0, 100)] = 0
-    """How often; 0: never (the paper)."""
+    """How often at most, until it stays; 0: never (the paper)."""
     weights: SceneWeights = IMAGE_ONLY
     """Of what the image says."""
     uniform_scale_weight: Weight = GROWTH

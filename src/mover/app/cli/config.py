@@ -54,7 +54,7 @@ RUN_SETTINGS = {
     "align.tilt_prior": "Expected error of the initial pitch and roll [rad].",
     "align.offset_prior": "Expected error of the heights of feet [m].",
     "lens.use": "Find the focal length from lines of the picture.",
-    "refine.rounds": "Rounds in which camera and floor are refined with the objects; 0: none.",
+    "refine.rounds": "Most rounds in which camera and floor are refined with the objects; 0: none.",
     "sizes.usual": "Standard deviation of the logarithm of given sizes.",
     "height_spread": "The same of people's height, where it is unknown.",
     "seat_heights": "The height of sitters constrains the scale.",
