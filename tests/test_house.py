@@ -26,11 +26,11 @@ LINES = {
     "src/mover/geometry": 3_530,
     "src/mover/io": 10_547,
     "src/mover/perceive": 2_865,
-    "src/mover/pipeline": 1_225,
+    "src/mover/pipeline": 1_237,
     "src/mover/stages": 6_134,
     "bench": 7_553,
     "benchmarks": 1_111,
-    "tests": 29_900,
+    "tests": 29_903,
 }
 FILES = {"src/mover": 239, "bench": 41}
 LIMITS = {
