@@ -13,6 +13,7 @@ for legs. All of it is one least-squares problem in logarithms, each line with a
 """
 
 import math
+from collections.abc import Collection
 
 import torch
 from jaxtyping import Bool, Float
@@ -36,6 +37,7 @@ CARRIED = ("seat", "left_thigh", "right_thigh")  # of a seated person
 LOWEST = 0.1  # share of a sitter's points below the top of the seat
 SAME = 0.3  # [m] between two who sit on one seat
 FEWEST = 3  # bodies that give the height of a seat
+SOURCES = ("people", "seats", "distances", "sizes", "standards")  #: of knowledge of the scale
 
 
 @record
@@ -52,7 +54,11 @@ class ScaleKnown:
 
 
 def common_scale(
-    layout: Layout, given: Given, categories: tuple[str, ...], known: ScaleKnown
+    layout: Layout,
+    given: Given,
+    categories: tuple[str, ...],
+    known: ScaleKnown,
+    sources: Collection[str] = SOURCES,
 ) -> tuple[float, float]:
     """Logarithm of how much too large the whole room is, and its standard deviation.
 
@@ -61,6 +67,7 @@ def common_scale(
         given: What was expected of them.
         categories: Of the objects.
         known: What else is known.
+        sources: Which of them count; the errors of the others have no bounds.
     """
     if known.people[1] <= 0:
         return 0.0, 0.0
@@ -70,24 +77,27 @@ def common_scale(
     scale, common, far, tool = unknowns[:4]
     own, true, usual = unknowns[4:].split((count, 3 * count, 3 * len(kinds)))
     true = true.view(count, 3, -1)
+    wide_of = {name: 1.0 if name in sources else math.inf for name in SOURCES}
     seen = Observations()
-    seen.add(scale, *known.people)
+    seen.add(scale, known.people[0], known.people[1] * wide_of["people"])
     seen.add(common, 0.0, max(known.shared, 1e-6))
     seen.add(far, 0.0, DISTANCES)
     seen.add(tool, 0.0, TOOL)
     seen.add(own, 0.0, COMMON)
     seen.add(usual, 0.0, 1.0, robust=True)
     if known.seats is not None:
-        seen.add(scale, *known.seats)
+        seen.add(scale, known.seats[0], known.seats[1] * wide_of["seats"])
     away = (layout.t_world_object.norm(dim=-1) / given.distance).log()
-    seen.add((scale + common + far).expand(count, -1), away, math.hypot(AWAY, FITTED), robust=True)
+    apart = math.hypot(AWAY, FITTED) * wide_of["distances"]
+    seen.add((scale + common + far).expand(count, -1), away, apart, robust=True)
     seen.add(scale + true, layout.log_scale, FITTED)
-    seen.add(true - common - tool - own[:, None], 0.0, SIZE)
+    seen.add(true - common - tool - own[:, None], 0.0, SIZE * wide_of["sizes"])
     known_sizes = given.precision > 0
     wide = given.precision[known_sizes].double().rsqrt()
     shared = KIND**0.5 * wide[:, None] * usual.view(-1, 3, len(unknowns))[kind][known_sizes]
     standard = given.standard[known_sizes]
-    seen.add(true[known_sizes] - shared, standard, (1 - KIND) ** 0.5 * wide, robust=True)
+    spread = (1 - KIND) ** 0.5 * wide * wide_of["standards"]
+    seen.add(true[known_sizes] - shared, standard, spread, robust=True)
     found = least_squares(seen)
     return float(found.mean[0]), float(found.covariance[0, 0]) ** 0.5
 
