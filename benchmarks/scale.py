@@ -1,4 +1,4 @@
-"""What tells how large a room is where no height is known: each source alone, and all but each.
+"""Which sources determine the scale of a room without a known height: each alone, all but each.
 
     python benchmarks/scale.py --rooms upstream:1000 upstream:1001
     python benchmarks/scale.py CAPTURE=HEIGHT...     # with the true height of its camera [m]
