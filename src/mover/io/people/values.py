@@ -39,9 +39,9 @@ def read_any(path: Path) -> At:
         raise InputError(f"{path.name}: is no file of kind {', '.join(KINDS)}")
     if kind in TREES:
         return TREES[kind](path)
-    with suppress(*BROKEN):  # a pickled object
-        if kind == ".npy":
-            return At(np.load(path, allow_pickle=False), path.name)
+    if kind == ".npy":
+        with suppress(*BROKEN), path.open("rb") as file:  # else a pickled object
+            return At(np.load(file, allow_pickle=False), path.name)
     return At(load_plain(path), path.name)
 
 
