@@ -30,6 +30,7 @@ from mover.pipeline.reconstruct import reconstruct
 from mover.stages.objects.room_scale import SOURCES, ScaleKnown, common_scale
 from mover_bench.experiment.job import noisy_room
 from mover_bench.experiment.sets import SETS
+from mover_bench.experiment.tables import LEVEL, RESAMPLES
 
 CHOICES: dict[str, tuple[str, ...]] = {
     "all": SOURCES,
@@ -38,7 +39,6 @@ CHOICES: dict[str, tuple[str, ...]] = {
 }
 Known = tuple[Layout, Given, tuple[str, ...], ScaleKnown]
 NONE = "none: as the people have it"
-DRAWS = 10_000
 
 
 def errors_of(capture: Capture, height: float) -> dict[str, tuple[float, float]]:
@@ -79,8 +79,10 @@ def table(rooms: list[dict[str, tuple[float, float]]]) -> list[str]:
             continue
         error, spread = np.array([room[name] for room in some]).T
         whole = np.array([room["all"][0] for room in some])
-        draw = rng.integers(0, len(some), (DRAWS, len(some)))
-        low, high = 100 * np.quantile(rms(error[draw]) - rms(whole[draw]), [0.025, 0.975])
+        draw = rng.integers(0, len(some), (RESAMPLES, len(some)))
+        low, high = 100 * np.quantile(
+            rms(error[draw]) - rms(whole[draw]), [(1 - LEVEL) / 2, (1 + LEVEL) / 2]
+        )
         lines.append(
             f"{name:<28} {len(some):>3} rooms {100 * rms(error):6.2f} %"
             f" {100 * (rms(error) - rms(whole)):+6.2f} [{low:+.2f}, {high:+.2f}]"
@@ -98,8 +100,7 @@ def main() -> None:
     cases: dict[str, Callable[[], tuple[Capture, float]]] = {}
     for name in args.captures:
         path, height = name.rsplit("=", 1)
-        cases[path] = partial(lambda path, height: (read_capture(Path(path)), float(height)),
-                              path, height)  # fmt: skip
+        cases[path] = lambda path=path, height=height: (read_capture(Path(path)), float(height))
     for name in args.rooms:
         kind, seed = name.split(":")
         trial = partial(noisy_room, int(seed), SETS[kind])

@@ -15,8 +15,8 @@ import pytest
 
 HOME = Path(__file__).parents[1]
 LINES = {
-    "src/mover/app": 4_286,
-    "src/mover/bodies": 2_017,
+    "src/mover/app": 4_292,
+    "src/mover/bodies": 2_018,
     "src/mover/core": 1_559,
     "src/mover/energy": 3_818,
     "src/mover/evaluate": 1_027,
@@ -24,13 +24,13 @@ LINES = {
     "src/mover/fitting": 2_097,
     "src/mover/furniture": 955,
     "src/mover/geometry": 3_530,
-    "src/mover/io": 10_547,
+    "src/mover/io": 10_550,
     "src/mover/perceive": 2_865,
     "src/mover/pipeline": 1_237,
     "src/mover/stages": 6_144,
     "bench": 7_553,
-    "benchmarks": 1_229,
-    "tests": 29_903,
+    "benchmarks": 1_230,
+    "tests": 29_915,
 }
 FILES = {"src/mover": 239, "bench": 41}
 LIMITS = {

@@ -136,6 +136,19 @@ def seen(points: torch.Tensor) -> np.ndarray:
     return project(points, CAMERA.K).numpy()
 
 
+def test_files_of_a_folder_are_read_whatever_their_kind_and_case(tmp_path, faces):
+    path = made.write_sam3dbody(tmp_path)
+    whole = bodies_from("sam3dbody", path, known_of("sam3dbody", faces)).bodies
+    first, second, *_ = sorted(path.glob("*.npz"))
+    first.rename(first.with_suffix(".NPZ"))
+    with np.load(second) as arrays:
+        second.with_suffix(".pkl").write_bytes(pickle.dumps(dict(arrays)))
+    second.unlink()
+    found = bodies_from("sam3dbody", path, known_of("sam3dbody", faces)).bodies
+    assert found.frame.tolist() == whole.frame.tolist()
+    assert torch.equal(found.verts.sum((1, 2)).sort()[0], whole.verts.sum((1, 2)).sort()[0])
+
+
 @pytest.mark.parametrize("tool", CASES)
 def test_bodies_are_right_upright_and_not_mirrored_and_read_again(tool, tmp_path, faces):
     case, found = CASES[tool], imported(tool, tmp_path, faces, fps=30.0)

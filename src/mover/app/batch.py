@@ -122,8 +122,10 @@ def earlier(job: BatchJob, retry: bool = False) -> Outcome | None:
     if found.get("fingerprint") != job.fingerprint:
         return None
     seconds, reason = float(found.get("seconds", 0.0)), str(found.get("reason", ""))
-    stands = not retry if reason else all((out / name).is_file() for name in PRODUCTS)
-    return Outcome(job.name, "failed" if reason else "kept", seconds, reason) if stands else None
+    if reason:
+        return None if retry else Outcome(job.name, "failed", seconds, reason)
+    whole = all((out / name).is_file() for name in PRODUCTS)
+    return Outcome(job.name, "kept", seconds) if whole else None
 
 
 def run_job(job: BatchJob) -> Outcome:
@@ -155,9 +157,13 @@ def _run(job: BatchJob, out: Path, lock: int) -> Outcome:
     if code in INTERRUPTED:
         return Outcome(job.name, "stopped")
     missing = " and ".join(name for name in PRODUCTS if not (out / name).is_file())
-    why = f"exit code {code}" if code else missing and f"ended well without {missing}"
+    why = ""
     if code < 0:
         why = f"ended by signal {-code} ({signal.strsignal(-code)})"
+    elif code:
+        why = f"exit code {code}"
+    elif missing:
+        why = f"ended well without {missing}"
     return ended(job, time.monotonic() - start, why and f"{why}: {last_line(out / LOG)}")
 
 

@@ -11,7 +11,6 @@ bodies are turned by the true direction of gravity; upstream trusts the camera t
 
 import hashlib
 import logging
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -67,8 +66,10 @@ def _joined(fans: list[list[int]], into: int, out: int) -> list[list[int]]:
     end = next((fan for fan in fans if fan[-1] == into), None)
     start = next((fan for fan in fans if fan[0] == out), None)
     wider = [*(end or [into]), *(start or [out])]
+    if end is None and start is None:
+        return [*fans, wider]
     if end is start:
-        return [*fans, wider] if end is None else fans if len(fans) == 1 else []
+        return fans if len(fans) == 1 else []
     at = next(k for k, fan in enumerate(fans) if fan is (end or start))
     others = [fan for fan in (*fans[at + 1 :], *fans[:at]) if fan is not start]
     if end is None or (start and fans[0] is end):
@@ -109,10 +110,10 @@ def spirals(
 def _read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and triangles in the order of the file; nothing is merged."""
     try:
-        text = path.read_text()
-        verts = re.findall(r"^v[ \t]+(\S+)[ \t]+(\S+)[ \t]+(\S+)", text, re.M)
-        faces = re.findall(r"^f[ \t]+(\d+)\S*[ \t]+(\d+)\S*[ \t]+(\d+)", text, re.M)
-        return np.asarray(verts, dtype=float), np.asarray(faces, dtype=np.int64) - 1
+        rows = [line.split() for line in path.read_text().splitlines()]
+        verts = [[float(w) for w in row[1:4]] for row in rows if row[:1] == ["v"]]
+        faces = [[int(w.split("/")[0]) - 1 for w in row[1:4]] for row in rows if row[:1] == ["f"]]
+        return np.asarray(verts).reshape(-1, 3), np.asarray(faces, dtype=np.int64).reshape(-1, 3)
     except BROKEN as error:
         raise InputError(f"{path}: cannot be read as a mesh ({error})") from error
 

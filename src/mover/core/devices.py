@@ -47,7 +47,7 @@ def constant(values: Any, like: Tensor) -> Tensor:  # noqa: ANN401
 _made = cache(torch.tensor)
 
 
-def least_squares(left: Float[Tensor, "rows unknowns"], right: Tensor) -> Tensor:
+def lstsq(left: Float[Tensor, "rows unknowns"], right: Tensor) -> Tensor:
     """The x of least |left @ x - right|, to the same bits each time, for one column or more.
 
     The default driver of `torch.linalg.lstsq` on the processor (gelsy) reads pivots that are

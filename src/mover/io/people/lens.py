@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mover.core.devices import least_squares
+from mover.core.devices import lstsq
 from mover.core.types import Camera
 from mover.geometry.rotations import axis_angle
 from mover.io.files.fields import At
@@ -77,7 +77,7 @@ def lens_of(points: Float[Tensor, "points 3"], pixels: Float[Tensor, "points 2"]
     rays = (points[:, :2] / points[:, 2:]).double()
     centre = torch.eye(2).double().repeat_interleave(len(rays), 0)  # first all x, then all y
     left = torch.cat([rays.T.reshape(-1, 1), centre], 1)
-    f, cx, cy = least_squares(left, pixels.double().T.flatten()).tolist()
+    f, cx, cy = lstsq(left, pixels.double().T.flatten()).tolist()
     return lens(f, f, cx, cy)
 
 

@@ -380,8 +380,11 @@ def sam3dbody(path: Path, known: Known) -> Iterator[Person]:
     what is left is the frame. The vertices lie about the origin of the body, whose camera_t is
     added [m].
     """
-    kinds = "a file for each person or image", *(f"*{kind}" for kind in v.KINDS)
-    files = v.files_of(path, *kinds)
+    files = [path]
+    if path.is_dir():
+        files = sorted((f for f in path.iterdir() if f.suffix.lower() in v.KINDS), key=v.natural)
+    if not files:
+        raise InputError(f"{path}: has no files of kind {', '.join(v.KINDS)}")
     images = [f.with_stem(re.sub(r"_?(?:subj|person|human)_?\d+$", "", f.stem)) for f in files]
     for file, frame in zip(files, v.frames_in(images, path, known), strict=True):
         at = v.read_any(file)

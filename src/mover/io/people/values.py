@@ -112,7 +112,7 @@ def frames_in(images: Sequence[Path], path: Path, known: Known) -> list[int]:
     """
     if not path.is_dir():
         return [0 for _ in images]
-    names = [image.stem if image.suffix in KINDS else image.name for image in images]
+    names = [image.stem if image.suffix.lower() in KINDS else image.name for image in images]
     frames = known.frames
     if frames is None:
         numbered = frame_numbers(names, path.name)

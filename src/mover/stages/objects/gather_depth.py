@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mover.core.devices import least_squares
+from mover.core.devices import lstsq
 from mover.core.records import record
 from mover.core.types import Camera, DepthImage, Layout, Objects
 from mover.energy.image_terms import Measured
@@ -120,7 +120,7 @@ def _line(found: References) -> tuple[float, float] | None:
     line = row.new_zeros(2)
     for _ in range(ROUNDS):
         left = (row * weight.double()[:, None]).mT
-        line = least_squares(left @ row, left @ target.double())
+        line = lstsq(left @ row, left @ target.double())
         off = (row @ line - target) * found.known / SPREAD
         weight = found.weight * found.known.square() / (1 + off.square()).float()
     factor, shift = line.tolist()

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from mover.bodies.corrected import has_mean_shape, larger, statures
 from mover.bodies.parts import BodyParts
-from mover.core.devices import least_squares
+from mover.core.devices import lstsq
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
 from mover.core.types import Bodies, Camera, People
@@ -83,11 +83,11 @@ def peak_of(curves: Float[Tensor, "used factors"], config: DepthConfig) -> Peak:
     grid = torch.linspace(-config.span, config.span, factors).double()
     x = grid[low:high] - grid[best]
     design = torch.stack([x.square(), x, torch.ones_like(x)], -1)
-    bend, slope, _ = least_squares(design, total[low:high]).tolist()
+    bend, slope, _ = lstsq(design, total[low:high]).tolist()
     if bend >= 0 or best in (0, factors - 1):
         return _unknown(f"more than {100 * config.span:.0f} % wrong or unclear")
     factor = 1 + float(grid[best]) - slope / (2 * bend)
-    each = least_squares(design, curves.double()[:, low:high].mT)
+    each = lstsq(design, curves.double()[:, low:high].mT)
     lean = each[1] + 2 * each[0] * (factor - 1 - float(grid[best]))
     error = float(lean.std()) / len(curves) ** 0.5 / abs(2 * bend)
     spread = (error**2 + SYSTEMATIC**2) ** 0.5
