@@ -21,6 +21,7 @@ from mover.app.batch import read_tree
 from mover.core import records
 from mover.core.files import replacing
 from mover.core.run import Run, sources
+from mover.evaluate.bodies import shared_rows
 from mover.extensions import reconstruct
 from mover.stages.config import RefineBodiesConfig
 from mover.stages.people.refine_bodies import refine_bodies
@@ -49,7 +50,12 @@ def with_noise(room: KnownRoom, seed: int, rooms: RoomSet) -> Trial:
     if rooms.withheld is not None:
         capture = without_seat(capture, room)
     used = tuple(bool((room.touched == k).any()) for k in range(len(room.truth.objects)))
-    return Trial(capture, room.truth, room.bodies, used)
+    touching = None
+    if capture.bodies is not None:
+        rows, true = shared_rows(capture.bodies, room.bodies)
+        touching = torch.zeros(capture.bodies.verts.shape[:2], dtype=torch.bool)
+        touching[rows] = room.touching[true]
+    return Trial(capture, room.truth, room.bodies, used, touching)
 
 
 def key_of(rooms: RoomSet, seed: int, variant: Variant) -> str:
@@ -72,6 +78,8 @@ def is_finished(out: Path, rooms: str, seed: int, name: str) -> bool:
 def measured(trial: Trial, judge: Judge, variant: Variant, run: Run) -> dict[str, Any]:
     """Reconstruct a room as a variant does and measure it."""
     capture = withheld(trial.capture, variant.given, variant.cut)
+    if variant.given == "true contacts" and trial.touching is not None:
+        capture = replace(capture, touch=trial.touching.float())
     room = reconstruct(capture, variant.config, run)
     if room.bodies is None or variant.cut is not None:
         room = under_camera(room, trial.capture, room.scene.camera)

@@ -5,6 +5,8 @@ from dataclasses import replace
 from typing import Any
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from mover.core.records import record
 from mover.core.types import Bodies, Camera, Capture, Room, Scene, SceneObject
@@ -32,6 +34,8 @@ class Trial:
     bodies: Bodies | None  #: the true people
     used: tuple[bool, ...] = ()
     """Which true objects people sit or lie on, lean on or lay a hand on."""
+    touching: Bool[Tensor, "bodies verts"] | None = None
+    """Which skin of the capture's bodies truly touches an object or the floor."""
 
 
 class Judge:

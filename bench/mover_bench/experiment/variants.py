@@ -14,7 +14,7 @@ from mover.pipeline.presets import PRESETS, READINGS, Config, literally
 from mover.stages.config import LensConfig, SpreadConfig
 from mover_bench.experiment.sets import CHANGES
 
-Given = Literal["all", "no contact", "no people"]
+Given = Literal["all", "true contacts", "no contact", "no people"]
 SEGMENTS = 10  # of each length, as in the paper
 LENGTHS = (10, 20, 30)  # [s]
 FRAMES = 5  # single frames whose results are averaged
@@ -36,7 +36,8 @@ class Variant:
 
     config: Config
     given: Given = "all"
-    """What of the people is given: `no contact`: they touch nothing; `no people`: an image."""
+    """What of the people is given: `true contacts`: also which skin touches something, without
+    error; `no contact`: they touch nothing; `no people`: an image."""
     cut: Cut | None = None  #: part of the video; None: all of it
     change: str = ""  #: an error of the input in another size, such as `scale=0.25`
     refined: bool = False  #: the room refines the people before anything is measured
@@ -69,6 +70,7 @@ def _subsets(preset: str, prefix: str) -> dict[str, Variant]:
 
 NO_WALLS = {s: replace(getattr(ROBUST, s), wall_alignment_steps=0) for s in ("layout", "place")}
 NOT_GIVEN = replace(ROBUST.layout, weights=replace(ROBUST.layout.weights, given=0.0))
+_IMAGE = weighted(PRESETS["paper"], contact=0.0, depth=0.0, collision=0.0)
 LISTS: dict[str, dict[str, Variant]] = {
     "ablation": {
         "robust": Variant(ROBUST),
@@ -81,6 +83,16 @@ LISTS: dict[str, dict[str, Variant]] = {
         "refined-people": Variant(ROBUST, refined=True),
     },
     "terms": {"paper": Variant(PRESETS["paper"]), **_subsets("paper", "paper-")},
+    "presets": {
+        "robust": Variant(ROBUST),
+        NO_TERM: with_terms(ROBUST),
+        "paper": Variant(PRESETS["paper"]),
+        f"paper-{NO_TERM}": with_terms(PRESETS["paper"]),
+        "true-contacts": Variant(PRESETS["paper"], "true contacts"),
+        f"true-contacts-{NO_TERM}": Variant(_IMAGE, "true contacts"),
+        "printed": Variant(PRESETS["printed"]),
+        f"printed-{NO_TERM}": with_terms(PRESETS["printed"]),
+    },
     "readings": {
         "paper": Variant(PRESETS["paper"]),
         "printed": Variant(PRESETS["printed"]),

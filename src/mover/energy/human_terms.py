@@ -23,6 +23,7 @@ from mover.core.types import Layout, Objects
 from mover.energy.config import Variant
 from mover.energy.minimize import geman_mcclure, safe_norm
 from mover.geometry.crops import depth_in
+from mover.geometry.nearest import pairs
 from mover.geometry.raster import Depths
 from mover.geometry.rotations import rot_y
 from mover.geometry.volume import Volume, sample
@@ -108,21 +109,27 @@ def depth_term(
     Paper: the sum over pixels; bounds that contradict each other are no range, unless they `count`.
     Robust: the mean over the constrained pixels, with 2 cm slack, clamped.
     """
-    inside = seen.covered & (mask > 0.5)
+    ranged = (mask > 0.5) & (allowed.near.isfinite() | allowed.far.isfinite())
     if form == "robust":
-        sane = allowed.near < allowed.far
-        bounded = inside & sane & (allowed.near.isfinite() | allowed.far.isfinite())
-        out = _short(allowed.near - DEPTH_MARGIN, seen.nearest, CLAMP)
-        out = out + _short(seen.nearest, allowed.far + DEPTH_MARGIN, CLAMP)
-        return (out * bounded).sum((-2, -1)) / bounded.sum((-2, -1)).clamp_min(FEWEST)
-    ranged = inside if contradiction == "count" else inside & (allowed.near <= allowed.far)
-    out = _short(allowed.near, seen.nearest) + _short(seen.nearest, allowed.far)
-    return (out * ranged).sum((-2, -1)) * allowed.area
+        ranged = ranged & (allowed.near < allowed.far)
+    elif contradiction == "skip":
+        ranged = ranged & (allowed.near <= allowed.far)
+    item, pixel = ranged.flatten(1).nonzero(as_tuple=True)  # few pixels have bounds
+    near, far = (x.flatten(1)[item, pixel] for x in (allowed.near, allowed.far))
+    nearest, covered = (x.flatten(-2)[..., item, pixel] for x in (seen.nearest, seen.covered))
+    none = nearest.new_zeros(*nearest.shape[:-1], len(mask))
+    if form == "robust":
+        out = _short(near - DEPTH_MARGIN, nearest, CLAMP)
+        out = out + _short(nearest, far + DEPTH_MARGIN, CLAMP)
+        count = none.index_add(-1, item, covered.to(none)).clamp_min(FEWEST)
+        return none.index_add(-1, item, out * covered) / count
+    out = _short(near, nearest) + _short(nearest, far)
+    return none.index_add(-1, item, out * covered) * allowed.area
 
 
 def _short(
-    lower: Float[Tensor, "*any h w"], upper: Float[Tensor, "*more h w"], limit: float = float("inf")
-) -> Float[Tensor, "*most h w"]:
+    lower: Float[Tensor, "*any"], upper: Float[Tensor, "*more"], limit: float = float("inf")
+) -> Float[Tensor, "*most"]:
     """How much `lower` exceeds `upper`; unbounded pixels (infinite) cost nothing."""
     gap = lower - upper
     return gap.nan_to_num(0.0, 0.0, 0.0).clamp(0, limit)
@@ -251,28 +258,28 @@ def contact_distance(
     Or, by `components`, the vertical distance to the nearest point of the top and the horizontal
     one to that of the back, if there is one. The pairing has no gradient.
     """
-    index = touches.object_of
-    t, scale = layout.t_world_object[..., index, :].unsqueeze(-2), layout.log_scale[..., index, :]
-    turn, scale = rot_y(layout.yaw[..., index]), scale.exp()
+    real, parts = touches.weight > 0, torch.arange(4).to(touches.object_of)[:, None]
     found: list[Tensor] = []
-    for k, region in enumerate((objects.top[index], objects.back[index])):
-        asking = touches.points if components else touches.points[:, k::2]
-        query = asking.flatten(1, 2)  # of the body, then of the hands
-        own, points = (query - t) @ turn, region * scale.unsqueeze(-2)
-        exact = "donot_use_mm_for_euclid_dist"
-        pair = torch.cdist(own.detach(), points.detach(), compute_mode=exact).argmin(-1)
-        pairs = pair.unsqueeze(-1).expand(*pair.shape, 3)
-        chosen = region.expand(*pair.shape[:-1], -1, 3).gather(-2, pairs)
-        gap = query - (chosen * scale.unsqueeze(-2)) @ turn.mT - t
-        if components:
-            axes = constant((1.0, 0.0, 1.0) if k else (0.0, 1.0, 0.0), gap)
-            there = objects.has_back[index] if k else torch.ones_like(objects.has_back[index])
-            gap = gap * axes * there[:, None, None]
-        found.append(safe_norm(gap))
-    if components:
-        return (found[0] + found[1]).unflatten(-1, (4, -1))
-    both = torch.stack(found, -2).unflatten(-1, (2, -1))  # region, body or hand
-    return both.transpose(-3, -2).flatten(-3, -2)
+    places: list[Tensor] = []
+    for row, item in enumerate(touches.object_of.tolist()):
+        t, scale = layout.t_world_object[..., item, None, :], layout.log_scale[..., item, None, :]
+        turn, scale = rot_y(layout.yaw[..., item]), scale.exp()
+        for k, region in enumerate((objects.top[item], objects.back[item])):
+            asked = real[row] if components else real[row] & (parts % 2 == k)
+            if not asked.any() or (components and k and not objects.has_back[item]):
+                continue
+            query = touches.points[row][asked]
+            pair = pairs(((query - t) @ turn).detach(), (region * scale).detach())
+            gap = query - (region[pair] * scale) @ turn.mT - t
+            if components:
+                gap = gap * constant((1.0, 0.0, 1.0) if k else (0.0, 1.0, 0.0), gap)
+            found.append(safe_norm(gap))
+            places.append(asked.flatten().nonzero()[:, 0] + row * asked.numel())
+    starts, shape = layout.yaw.shape[:-1], touches.weight.shape
+    flat = layout.yaw.new_zeros(*starts, touches.weight.numel())
+    if found:
+        flat = flat.index_add(-1, torch.cat(places), torch.cat(found, -1))
+    return flat.unflatten(-1, shape)
 
 
 def contact_term(

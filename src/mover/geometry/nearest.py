@@ -23,6 +23,17 @@ def nearest_points(
     return torch.from_numpy(distance).to(query), torch.from_numpy(index).to(query.device)
 
 
+def pairs(
+    query: Float[Tensor, "*starts q 3"], points: Float[Tensor, "*starts p 3"]
+) -> Int[Tensor, "*starts q"]:
+    """Index of the nearest of `points` for each query point, for each start (NaN: any)."""
+    if query.is_cuda:
+        return torch.cdist(query, points, compute_mode="donot_use_mm_for_euclid_dist").argmin(-1)
+    starts = (x.nan_to_num(0, 0, 0).reshape(-1, *x.shape[-2:]) for x in (query, points))
+    found = [nearest_points(*one)[1] for one in zip(*starts, strict=True)]
+    return torch.stack(found).view(query.shape[:-1])
+
+
 def to_surface(
     query: Float[Tensor, "q 3"], verts: Float[Tensor, "verts 3"], faces: Int[Tensor, "faces 3"]
 ) -> Float[Tensor, " q"]:
