@@ -29,6 +29,7 @@ BROKEN = (
     SyntaxError, TokenError,  # numpy's headers are Python
 )  # fmt: skip
 """What reading a broken file of arrays raises."""
+MOST = 1000  # combinations of shapes that a record remembers
 _check = beartype(conf=BeartypeConf(is_pep484_tower=True))
 
 
@@ -39,13 +40,28 @@ def record(cls: type[T]) -> type[T]:
     plain = made.__init__
     plain.__annotations__.pop("return")  # else all is checked once more, after the call
     checked = cache(lambda: jaxtyped(typechecker=_check)(plain))  # made where it is built first
+    known: set[tuple[Any, ...]] = set()  # what has passed: loops build the same thousands of times
 
     @wraps(plain)
     def init(self: Any, *args: Any, **fields: Any) -> None:  # noqa: ANN401
+        kind = (*map(_kind, args), *fields, *map(_kind, fields.values()))
+        if kind in known:
+            plain(self, *args, **fields)
+            return
         checked()(self, *args, **fields)
+        if None not in kind and len(known) < MOST:
+            known.add(kind)
 
     made.__init__ = init
     return made
+
+
+def _kind(value: object) -> object:
+    """All of a value that a check of a record looks at; None: its parts are looked at, too."""
+    if isinstance(value, Tensor):
+        return value.dtype, value.shape
+    simple = value is None or isinstance(value, (bool, int, float))
+    return type(value) if simple or dataclasses.is_dataclass(value) else None
 
 
 def map_tensors(fn: Callable[[Tensor], Tensor], value: T) -> T:
