@@ -53,14 +53,12 @@ def errors_of(capture: Capture, height: float) -> dict[str, tuple[float, float]]
         room = reconstruct(capture, PRESETS["robust"], Run(Path(folder)))
     if not found:
         return {}
-    args = found[0]
-    scale, _ = common_scale(*args)
+    scale, _ = common_scale(*(args := found[0]))
     assert room.scene.ground is not None
     true = math.log(-room.scene.ground / height) + scale  # before it was divided by the scale
-    known = args[-1]
-    errors = {NONE: (-true, known.people[1])}
+    errors = {NONE: (-true, args[-1].people[1])}
     for name, sources in CHOICES.items():
-        if sources != ("seats",) or known.seats is not None:
+        if sources != ("seats",) or args[-1].seats is not None:
             value, spread = common_scale(*args, sources)
             errors[name] = value - true, spread
     return errors

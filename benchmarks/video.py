@@ -24,6 +24,7 @@ from fit import heights_in, misses, postures
 
 from mover.app.cli.run import reconstruct_into
 from mover.app.cli.video import VideoArgs, video_to_room
+from mover.app.pictures.film import save_film
 from mover.app.results import Origin
 from mover.bodies.corrected import in_world
 from mover.core.types import Scene
@@ -43,9 +44,9 @@ from mover.io.files.meshes import write_mesh
 from mover.pipeline.presets import PRESETS
 from mover_bench.experiment.sets import parse_seeds
 from mover_bench.rooms.config import NoiseConfig, RoomConfig
-from mover_bench.rooms.known import KnownRoom, make_room
+from mover_bench.rooms.known import KnownRoom, draw_frame, make_room
 from mover_bench.rooms.noise import add_noise
-from mover_bench.rooms.seen import COCO, Seen, write_video
+from mover_bench.rooms.seen import COCO, Seen
 
 FPS = 5.0
 KINDS = ("depth", "disparity")
@@ -205,8 +206,9 @@ def trial(seed: int, out: Path, args: argparse.Namespace) -> dict[str, Any]:
         return json.loads(kept.read_text())
     room = make_room(seed, RoomConfig(fps=FPS))
     out.mkdir(parents=True, exist_ok=True)
+    frames = range(int(room.bodies.frame.max()) + 1)
     if not (out / "video.mp4").is_file():
-        write_video(room, out / "video.mp4")
+        save_film((draw_frame(room, k) for k in frames), FPS, out / "video.mp4")
     seen = Seen(room, add_noise(room, NoiseConfig(), seed), seed)
     meshes = other_designs(room, out / "meshes") if args.other_designs else None
     heights = tuple(heights_in(room.bodies).tolist()) if args.height else ()

@@ -195,9 +195,6 @@ def test_soft_labels_are_labels_and_a_dancer_is_a_person(tmp_path):
     assert "a.json: 1 boxes have no mask, which people need: left out" in boxes.notes
 
 
-# Things in one picture.
-
-
 def grounded(folder: Path) -> Path:
     """DUMP_JSON_RESULTS of grounded_sam2_local_demo.py; scores as SAM 2 has them, lists of one."""
     row = {"class_name": "chair", "bbox": [4.0, 10.0, 18.0, 40.0],

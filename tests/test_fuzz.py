@@ -84,9 +84,6 @@ def said(error: InputError) -> str:
     return text
 
 
-# Captures.
-
-
 def in_json(folder: Path, rng: np.random.Generator) -> str:
     """One value of one file is another, is a multiple of itself, or is not there."""
     path = folder / str(rng.choice(["camera", "scene", "objects", "people", "hypotheses"]))
@@ -301,9 +298,6 @@ def test_bad_pickles_are_refused_by_every_reader(tmp_path, monkeypatch, every, r
     print(f"bad pickles x readers: {dict(counts)}")  # noqa: T201
     assert counts["refused"] >= refused
     assert sum(counts.values()) >= read
-
-
-# Stages.
 
 
 @pytest.mark.parametrize("seed", range(24))

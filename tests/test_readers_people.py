@@ -588,9 +588,6 @@ def test_pieces_of_whams_walker_are_one_person_and_the_user_can_join_more(tmp_pa
         bodies_from("wham", path, KNOWN)
 
 
-# Keypoints.
-
-
 @pytest.mark.parametrize("tool", made.KEYPOINTS)
 def test_keypoints_fall_on_the_joints_they_name_and_are_read_again(tool, tmp_path):
     found = keypoints_from(tool.split(":")[0], made.KEYPOINTS[tool](tmp_path), Known(fps=30.0))
@@ -662,9 +659,6 @@ def test_joints_with_nan_are_missing_and_another_number_of_them_is_refused(tmp_p
         keypoints_from("openpose", tmp_path / "v_000000000000_keypoints.json")
 
 
-# The command.
-
-
 def test_the_command_writes_bodies(tmp_path, capsys):
     path, out = made.write_gvhmr(tmp_path), tmp_path / "bodies.npz"
     (tmp_path / "camera.json").write_text(json.dumps(made.camera_json()))
@@ -699,8 +693,6 @@ def test_the_command_writes_keypoints_and_names_the_tools(tmp_path, capsys):
     assert cli.run_command("import-bodies", ["smpl", str(path)]) == 2
     assert "sam3dbody" in capsys.readouterr().err
 
-
-# Real files.
 
 SHARED = Path(__file__).parents[2] / "shared" / "data" / "sam3d_body"
 

@@ -134,9 +134,6 @@ def test_what_is_uncertain_keeps_its_number():
     assert pair_tracks(apart, masks_of(elsewhere), CAMERA).notes == ()
 
 
-# Pieces of one track.
-
-
 def walk(spans: dict[int, range], step: float = 0.02) -> tuple[torch.Tensor, ...]:
     """One who walks to the right, as the tracks of these frames."""
     rows = [(f, track) for track, span in spans.items() for f in span]

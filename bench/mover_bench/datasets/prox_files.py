@@ -246,9 +246,6 @@ def read_body_index(path: Path) -> Bool[np.ndarray, "h w"]:
     return person[:, ::-1]
 
 
-# OpenPose's keypoints of PROX, of pictures that are stored mirrored or of flipped ones.
-
-
 PAIRS_25 = ((2, 5), (3, 6), (4, 7), (9, 12), (10, 13), (11, 14), (15, 16), (17, 18),
             (19, 22), (20, 23), (21, 24))  # fmt: skip
 """BODY_25: right and left."""

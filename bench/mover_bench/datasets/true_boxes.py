@@ -168,9 +168,6 @@ def _inside(scan: Mesh, box: TrueBox, order: Sequence[int], signs: Matrix) -> Me
     return used(Mesh(torch.from_numpy(local).float(), torch.from_numpy(faces)))
 
 
-# Scans of rooms and their floors.
-
-
 BIN = 0.02  # [m], of the histogram of heights
 REACH = 0.6  # [m], the floor is so near to the lowest points
 SHARE = 0.25  # of the fullest bin there: less is noise below the floor

@@ -100,9 +100,6 @@ RULES: dict[Rule, Callable[[np.random.Generator, Size, np.ndarray, Others], Pose
 """Draws (x [m], z [m], heading [rad]) of a piece of a size among others; None: nowhere."""
 
 
-# How much of each piece of furniture other pieces hide, in a small picture without people.
-
-
 WIDTH = 240  # [px] of the small picture
 HIDDEN = 0.3  # a piece of which more is hidden counts as hidden
 

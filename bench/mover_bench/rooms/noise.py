@@ -66,9 +66,6 @@ def foreign_shapes(
     return tuple(out)
 
 
-# Errors of body regression: depth, pose and place, slow or fast in time; missing frames.
-
-
 def noisy_bodies(room: KnownRoom, noise: NoiseConfig, rng: np.random.Generator) -> Bodies:
     """Bodies as a network would see them, skinned again from wrong pose parameters."""
     bodies = room.bodies

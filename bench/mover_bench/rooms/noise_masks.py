@@ -110,9 +110,6 @@ def leaked(mask: Bool[np.ndarray, "h w"], where: float) -> Bool[np.ndarray, "h w
     return mask | ((v - rows[centre]) ** 2 + (u - cols[centre]) ** 2 <= radius**2)
 
 
-# Errors of an instance detector: objects missed, invented, run together, or called by wrong names.
-
-
 KINDS = tuple(PIECES)  # what a detector has a class for
 TOUCH = 2  # [px], masks that come nearer than this may run together
 
@@ -211,9 +208,6 @@ def _with_false(capture: Capture, index: int, floor: float, rng: np.random.Gener
     found = Detection(number, new.category, box_of_mask(patch), encode([patch]), 0.6)
     scene = replace(capture.scene, objects=(*capture.scene.objects, piece))
     return replace(capture, scene=scene, detections=(*capture.detections, found))
-
-
-# Masks as networks draw them: by a coarse head in a wrong box, of what is hidden, wobbling.
 
 
 FINER = 0.3  # share of masks of a head with twice as many cells a side

@@ -146,9 +146,6 @@ def settle_down(still: Posture, times: np.ndarray, phase: float, amount: float) 
     return replace(posture, spine=spine, head=head, wrists=posture.wrists + np.abs(wave))
 
 
-# Standing at a table with a hand on it.
-
-
 REACH_TIME = 1.6  # [s]
 AWAY = 0.22  # [m], from the edge to the middle of the body
 INSIDE = 0.1  # [m], from the edge to the wrist
@@ -223,9 +220,6 @@ def reach_out(end: Posture, stand: Posture, share: np.ndarray) -> Posture:
     first, second = share[share < 0.5], share[share >= 0.5]
     parts = ((start, raised, 2 * first), (raised, goal, 2 * second - 1))
     return chain([blend(a, b, smooth(part)) for a, b, part in parts if len(part)])
-
-
-# Lying on a bed or a sofa: from its edge onto the back, onto the side, and up again.
 
 
 LIE_TIME = 2.6  # [s]

@@ -10,7 +10,6 @@ seconds in the same wrong place, by some networks with full confidence.
 """
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -27,7 +26,7 @@ from mover.perceive.capture import Finders
 from mover.perceive.config import ModelsConfig, PerceiveConfig
 from mover.perceive.networks import PERSON, DetectInputs, Finds, JointsInputs
 from mover.perceive.video import Clip
-from mover_bench.rooms.known import KnownRoom, draw_frame
+from mover_bench.rooms.known import KnownRoom
 from mover_bench.rooms.noise import slow
 
 COCO = {
@@ -166,11 +165,3 @@ def _attitude(points: Float[Tensor, "rows 17 3"]) -> Float[Tensor, "rows 3 3"]:
     spine = torch.nn.functional.normalize(spine, dim=-1)
     front = torch.nn.functional.normalize(torch.linalg.cross(across, spine), dim=-1)
     return torch.stack([torch.linalg.cross(spine, front), spine, front], -1)
-
-
-def write_video(room: KnownRoom, path: Path) -> None:
-    """The room as an MP4, drawn frame by frame."""
-    from mover.app.pictures.film import save_film
-
-    frames = int(room.bodies.frame.max()) + 1
-    save_film((draw_frame(room, k) for k in range(frames)), room.bodies.fps or 5.0, path)

@@ -87,9 +87,6 @@ def laid(person: Person, posture: Posture, piece: Placed, group: str) -> Posture
     return moved(posture, rise[:, None] * np.array([0.0, 1.0, 0.0]))
 
 
-# What is true of a body among furniture: how deep it sinks, what it touches, where it gapes.
-
-
 SINK = 0.02  # [m], deeper no body may be inside a piece
 GAPE = 0.01  # [m], farther no touch may be off
 SLACK = 1e-3  # [m], more than rounding

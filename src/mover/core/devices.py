@@ -31,12 +31,7 @@ def device_of(choice: Choice) -> torch.device:
 
 def named(device: torch.device) -> str:
     """What a log calls it: `cpu`, or `cuda` and the name of the GPU."""
-    if device.type != "cuda":
-        return str(device)
-    return f"cuda ({torch.cuda.get_device_name(device)})"
-
-
-# Small tensors that never change, made once for each device.
+    return str(device) if device.type != "cuda" else f"cuda ({torch.cuda.get_device_name(device)})"
 
 
 def constant(values: Any, like: Tensor) -> Tensor:  # noqa: ANN401

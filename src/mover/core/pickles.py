@@ -263,9 +263,6 @@ def _leaf(value: Any) -> tuple[Any, int]:  # noqa: ANN401
     return value, ITEM + letters + int(getattr(value, "nbytes", 0))
 
 
-# What the calls of the list describe.
-
-
 def _tensor(call: Call) -> torch.Tensor:
     """A tensor in a pickle of Python: a view of its storage."""
     storage, offset, size, stride = call.args[:4]

@@ -23,7 +23,7 @@ from mover.core.types import Layout, Objects
 from mover.energy.config import Variant
 from mover.energy.minimize import geman_mcclure, safe_norm
 from mover.geometry.crops import depth_in
-from mover.geometry.nearest import pairs
+from mover.geometry.nearest import nearest_points
 from mover.geometry.raster import Depths
 from mover.geometry.rotations import rot_y
 from mover.geometry.volume import Volume, sample
@@ -259,8 +259,7 @@ def contact_distance(
     one to that of the back, if there is one. The pairing has no gradient.
     """
     real, parts = touches.weight > 0, torch.arange(4).to(touches.object_of)[:, None]
-    found: list[Tensor] = []
-    places: list[Tensor] = []
+    found, places = list[Tensor](), list[Tensor]()
     for row, item in enumerate(touches.object_of.tolist()):
         t, scale = layout.t_world_object[..., item, None, :], layout.log_scale[..., item, None, :]
         turn, scale = rot_y(layout.yaw[..., item]), scale.exp()
@@ -269,17 +268,17 @@ def contact_distance(
             if not asked.any() or (components and k and not objects.has_back[item]):
                 continue
             query = touches.points[row][asked]
-            pair = pairs(((query - t) @ turn).detach(), (region * scale).detach())
+            own, points = ((query - t) @ turn).detach(), (region * scale).detach()
+            _, pair = nearest_points(own.nan_to_num(0, 0, 0), points.nan_to_num(0, 0, 0))
             gap = query - (region[pair] * scale) @ turn.mT - t
             if components:
                 gap = gap * constant((1.0, 0.0, 1.0) if k else (0.0, 1.0, 0.0), gap)
             found.append(safe_norm(gap))
             places.append(asked.flatten().nonzero()[:, 0] + row * asked.numel())
-    starts, shape = layout.yaw.shape[:-1], touches.weight.shape
-    flat = layout.yaw.new_zeros(*starts, touches.weight.numel())
+    flat = layout.yaw.new_zeros(*layout.yaw.shape[:-1], real.numel())
     if found:
         flat = flat.index_add(-1, torch.cat(places), torch.cat(found, -1))
-    return flat.unflatten(-1, shape)
+    return flat.unflatten(-1, real.shape)
 
 
 def contact_term(

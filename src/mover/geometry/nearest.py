@@ -7,31 +7,23 @@ from torch import Tensor
 
 
 def nearest_points(
-    query: Float[Tensor, "q 3"], points: Float[Tensor, "p 3"]
-) -> tuple[Float[Tensor, " q"], Int[Tensor, " q"]]:
-    """Distance [m] to, and index of, the nearest of `points` for each query point.
+    query: Float[Tensor, "*starts q 3"], points: Float[Tensor, "*starts p 3"]
+) -> tuple[Float[Tensor, "*starts q"], Int[Tensor, "*starts q"]]:
+    """Distance [m] to, and index of, the nearest of `points` for each query point, start by start.
 
     Raises:
         ValueError: If there are no points to find.
     """
     from scipy.spatial import KDTree
 
+    if query.ndim > 2:
+        distance, index = zip(*map(nearest_points, query, points), strict=True)
+        return torch.stack(distance), torch.stack(index)
     if len(points) == 0:
         raise ValueError("nearest_points: 'points' is empty, expected at least one point")
     tree = KDTree(as_float64(points))
     distance, index = tree.query(as_float64(query))
     return torch.from_numpy(distance).to(query), torch.from_numpy(index).to(query.device)
-
-
-def pairs(
-    query: Float[Tensor, "*starts q 3"], points: Float[Tensor, "*starts p 3"]
-) -> Int[Tensor, "*starts q"]:
-    """Index of the nearest of `points` for each query point, for each start (NaN: any)."""
-    if query.is_cuda:
-        return torch.cdist(query, points, compute_mode="donot_use_mm_for_euclid_dist").argmin(-1)
-    starts = (x.nan_to_num(0, 0, 0).reshape(-1, *x.shape[-2:]) for x in (query, points))
-    found = [nearest_points(*one)[1] for one in zip(*starts, strict=True)]
-    return torch.stack(found).view(query.shape[:-1])
 
 
 def to_surface(

@@ -114,10 +114,6 @@ def _bodies(points: np.ndarray, shell: np.ndarray) -> Triangles:
     return closed
 
 
-# Any furniture mesh as one closed solid in the same box: closed parts are kept as they are
-# (`solid`), everything else is wrapped (`wrap`).
-
-
 LARGE, LIGHT = 20_000, 10_000  # faces of an open mesh that is made lighter, and what is left
 WELD = 1e-6  # [longest side], vertices this near are one
 

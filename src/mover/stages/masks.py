@@ -153,9 +153,6 @@ def _thick(mask: Bool[Tensor, "h w"]) -> float:
     return 2 * float(depth_in(padded.numpy()).max()) - 1
 
 
-# How well drawn bodies fill a mask whose border may be too wide or too narrow everywhere.
-
-
 COVERED = 0.05  # of a pixel of the smaller picture, from which it counts as covered
 MARGINS = 9  # borders from one pixel too narrow to one pixel too wide are tried
 
@@ -201,9 +198,6 @@ def _grown(image: Bool[Tensor, "items h w"]) -> Bool[Tensor, "items h w"]:
     return grown
 
 
-# Masks of every few pixels, and back.
-
-
 def thin(masks: Masks, row: int, step: int) -> Bool[Tensor, "h w"]:
     """Every `step`-th pixel of one of the masks."""
     return torch.from_numpy(thinned(masks, row, step).copy())
@@ -223,9 +217,6 @@ def widened(masks: Bool[Tensor, "masks h w"], wide: int) -> Bool[Tensor, "masks 
     square, pixels = np.ones((2 * wide + 1, 2 * wide + 1), np.uint8), masks.cpu().numpy()
     grown = [cv2.dilate(one.astype(np.uint8), square) > 0 for one in pixels]
     return torch.from_numpy(np.stack(grown)).to(masks.device)
-
-
-# The image at the width at which the paper's weights have their meaning.
 
 
 ALL = slice(None)

@@ -225,9 +225,6 @@ def _workspace(size: BufferSize) -> Any:  # noqa: ANN401
     return space
 
 
-# What the kernel is given: objects without padding, windows with a border, people.
-
-
 BRICK = 8  # [cells], as in `Volume.busy`
 CALM = 2  # a brick without bodies, as in `kernels.simple`
 

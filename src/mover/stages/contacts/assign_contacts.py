@@ -59,9 +59,6 @@ def find_contacts(
     return ContactProbability(touching(inputs.bodies, inputs.parts, inputs.ground))
 
 
-# Thin clouds of points out to cells, so that their number does not grow with the video.
-
-
 GOLDEN = 0.6180339887498949  # its multiples, modulo 1, fill the unit interval evenly
 
 

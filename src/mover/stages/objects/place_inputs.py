@@ -66,9 +66,6 @@ def with_walls(inputs: PlaceInputs, walls: Walls | None) -> PlaceInputs:
     return replace(inputs, image=replace(inputs.image, walls=walls))
 
 
-# Windows of fewer pixels: what is far off is found there, at a fraction of the work.
-
-
 def coarser_image(image: ImageCues, factor: int) -> ImageCues:
     """The same with `factor` times fewer pixels along each side.
 

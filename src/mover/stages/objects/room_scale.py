@@ -8,7 +8,7 @@ for legs. All of it is one least-squares problem in logarithms, each line with a
     people: s = how much larger than theirs,   seats: s = how much too high people sit
     distance, placed / given  = s + m + d          d: error that all given distances share
     size, placed / given      = s + w_i b + x_ik   x: true size / given; b: shapes that do not fit
-                                                   (w_i) fill their masks by sizes that err alike
+                                                   (w_i) fill their masks by sizes of one error
     0                         = x_ik - m - t - o_i t: error of one tool, o: of one object, m: of all
     size, standard / given    = x_ik - g_ck        g: what the objects of one category share
 """

@@ -251,9 +251,6 @@ def order_bounds(
     )
 
 
-# The outlines of bodies, where they stand now, against those of their masks.
-
-
 @dataclass(frozen=True)
 class SeenBodies:
     """Bodies in camera axes, and what may hide them."""

@@ -102,9 +102,6 @@ def heading_cost(data: KernelInput, p: Pose) -> tuple[float, Slope]:
     return seated * (1.0 - s * x - c * z), Slope(0.0, 0.0, 0.0, turn, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-# The costs of contact and of collision (robust form) and their gradients.
-
-
 CALM = wp.constant(wp.uint8(2))  # a brick without bodies
 BRICK = wp.constant(3)  # bits, as in `lookup`
 EPS = wp.constant(1.0e-12)  # [m²], as in `minimize.safe_norm`
