@@ -43,7 +43,7 @@ SHORT = {
     "ground_penetration_frequency": "Freq.", "ground_penetration_distance": "Dist.",
     "pje": "PJE", "v2v": "V2V", "p_pje": "p.PJE", "p_v2v": "p.V2V",
 }  # fmt: skip
-FEW, JOB, STEP = 20.0, 60.0, 0.12
+FEW, JOB, STEP = 20.0, 60.0, 0.04
 """[s] of one core: a job without a descent, one but for steps of Adam, and each of these steps."""
 Jobs = Mapping[TableRow, Sequence[TableJob]]
 
