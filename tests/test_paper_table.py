@@ -222,7 +222,7 @@ def test_the_plan_counts_jobs_and_takes_the_time_of_those_that_have_ended(tmp_pa
     args = TableArgs(
         "prox-quantitative", there, tmp_path / "out", "paper", only=("initial", "full")
     )
-    assert planned(args).startswith("2 jobs of 1 captures, 2 to do: about 0.2 h of one core")
+    assert planned(args).startswith("2 jobs of 1 captures, 2 to do: about 0.1 h of one core")
     few = replace(args, steps=100)
     assert planned(few).startswith("2 jobs of 1 captures, 2 to do: about 0.0 h of one core")
     paper_table(args, pool=Answers())
