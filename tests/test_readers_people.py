@@ -480,8 +480,6 @@ def test_a_motion_of_amass_given_as_bodies_is_named(write, tmp_path):
     assert pose.body_pose.numpy() == pytest.approx(whole[:, 3:66], abs=1e-5)
 
 
-# What is no file of the tool at all: a pointer, a page, a part, nothing.
-
 INSTEAD = {
     "a pointer": (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "git lfs pull"),
     "a page": (b"\n<!DOCTYPE html>\n<html></html>", "a web page in place of the file"),
@@ -583,6 +581,8 @@ def test_pieces_of_whams_walker_are_one_person_and_the_user_can_join_more(tmp_pa
     assert bodies_from("wham", path, known).bodies.person.unique().tolist() == [0]
     made.dump({f"person_{track}": one for track, one in tracks.items()}, path)
     assert bodies_from("wham", path, KNOWN).bodies.person.unique().tolist() == [0, 17]
+    made.dump(list(tracks.values()), path)
+    assert bodies_from("wham", path, KNOWN).bodies.person.unique().tolist() == [0, 2]
     made.dump({"poses": np.zeros((5, 72)), "trans": np.zeros((5, 3))}, path)
     with pytest.raises(InputError, match=r"'poses' has .* a person under the number of a track"):
         bodies_from("wham", path, KNOWN)

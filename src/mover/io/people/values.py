@@ -144,7 +144,9 @@ def need(at: At, *names: str) -> At:
 
 
 def people_of(at: At) -> list[tuple[int, At]]:
-    """The people of a mapping from track to person, numbered by their keys or in order."""
+    """The people of a list, or of a mapping from track to person, by their keys or in order."""
+    if isinstance(at.value, list | tuple):
+        at = at.holding({str(number): one for number, one in enumerate(at.value)})
     keys = list(at.mapping())
     if not keys:
         raise InputError(f"{at.place} has no people, expected at least one track")

@@ -169,9 +169,6 @@ def placed(scene: Any, matrix: Matrix, work: Path, key: str) -> Placed:  # noqa:
     return pose.fields, found, pose.note
 
 
-# Names of nodes and files as categories and ids.
-
-
 SAFE = re.compile(r"[^\w.-]+")
 
 
