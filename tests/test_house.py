@@ -24,7 +24,7 @@ LINES = {
     "src/mover/fitting": 2_097,
     "src/mover/furniture": 955,
     "src/mover/geometry": 3_529,
-    "src/mover/io": 10_550,
+    "src/mover/io": 10_549,
     "src/mover/perceive": 2_865,
     "src/mover/pipeline": 1_235,
     "src/mover/stages": 6_138,
