@@ -188,21 +188,23 @@ TURNED, RAISED = math.radians(0.05), 0.005  # [rad] and share of the height: les
 
 
 def refine_camera_and_objects(setup: Setup, people: Located, placed: Arrangement) -> Arrangement:
-    """Camera and ground refined with the objects, and these placed again, until nothing changes."""
-    for number in range(setup.config.refine.rounds):
+    """Camera and ground refined with the objects, and these placed again, until nothing changes.
+
+    Where the feet leave the camera open, each round goes only a part of the way.
+    """
+    for _ in range(setup.config.refine.rounds):
         cues = setup.run.stage(find_image_cues, placed.image, setup.config.image)
         inputs = RefineInputs(
             placed.camera, placed.ground, people.alignment.posterior, setup.objects, cues,
             placed.layout,
         )  # fmt: skip
         better = setup.run.stage(refine_camera, inputs, setup.config.refine)
+        found = place_by_image(setup, better.camera, better.ground, placed)
+        traces = {**placed.traces, "camera": better.trace, **found.traces}
         turn = float((better.camera.R_cam_world - placed.camera.R_cam_world).norm()) / 2**0.5
-        still = turn < TURNED and abs(better.ground / placed.ground - 1) < RAISED
-        if not (number and still):
-            found = place_by_image(setup, better.camera, better.ground, placed)
-            traces = {**placed.traces, "camera": better.trace, **found.traces}
-            placed = replace(found, traces=traces)
-        if still:
+        rise = abs(better.ground / placed.ground - 1)
+        placed = replace(found, traces=traces)
+        if turn < TURNED and rise < RAISED:
             break
     return placed
 

@@ -11,8 +11,7 @@ Each object's energy is divided by its own residual: exact shapes pull hard, wro
 d is how far pitch, roll and ground are from those of the feet, C their covariance: a floor that was
 walked all around outweighs the objects, and what the feet left open is left to them. The borders
 of the masks are fixed as they suit the objects at first (`fixed_borders`). An object is carried by
-the ray to the centre of its base and grows with its distance, so a change of the camera leaves it
-where and as large as it is in the image: else the descent creeps along that valley.
+the ray to the centre of its base, so a change of the camera leaves it where it is in the image.
 """
 
 from dataclasses import replace
@@ -112,7 +111,7 @@ def refine_camera(
     zero = map_tensors(torch.zeros_like, fixed)
 
     def energies(joint: _Joint) -> Float[Tensor, " objects"]:
-        camera, layout = _unpack(joint, fixed, inputs.camera)
+        camera, layout = _unpack(joint, inputs)
         return of_layout(layout, camera.R_cam_world).per_item
 
     with torch.no_grad():
@@ -129,7 +128,7 @@ def refine_camera(
         return Refined(inputs.camera, inputs.ground, torch.zeros(0))
     found = minimize(energy, zero, config.method, observe, "refine_camera")
     joint = _shift(fixed, found.at)
-    camera, _ = _unpack(joint, fixed, inputs.camera)
+    camera, _ = _unpack(joint, inputs)
     return Refined(camera, float(joint.tilt[2]), found.trace)
 
 
@@ -143,16 +142,9 @@ def _shift(fixed: _Joint, free: _Joint) -> _Joint:
     )
 
 
-def _unpack(joint: _Joint, fixed: _Joint, camera: Camera) -> tuple[Camera, Layout]:
-    """The camera and the objects, each as large in the image as before wherever it stands now."""
-    R, t = _bases(joint)
-    away = t.norm(dim=-1) / _bases(fixed)[1].norm(dim=-1)
-    layout = Layout(t, joint.yaw, joint.log_scale + away.log()[:, None])
-    return replace(camera, R_cam_world=R), layout
-
-
-def _bases(joint: _Joint) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "objects 3"]]:
-    """The camera's rotation, and where the rays to the bases meet the floor."""
+def _unpack(joint: _Joint, inputs: RefineInputs) -> tuple[Camera, Layout]:
+    old = inputs.camera
     R = tilted(joint.tilt[0], joint.tilt[1])
     rays = torch.nn.functional.pad(joint.rays, (0, 1), value=1.0)
-    return R, hit_floor(rays, R, joint.tilt[2])
+    t = hit_floor(rays, R, joint.tilt[2])
+    return Camera(old.K, R, old.width, old.height), Layout(t, joint.yaw, joint.log_scale)
