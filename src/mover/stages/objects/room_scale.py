@@ -7,8 +7,7 @@ for legs. All of it is one least-squares problem in logarithms, each line with a
 
     people: s = how much larger than theirs,   seats: s = how much too high people sit
     distance, placed / given  = s + m + d          d: error that all given distances share
-    size, placed / given      = s + w_i b + x_ik   x: true size / given; b: shapes that do not fit
-                                                   (w_i) fill their masks by sizes of one error
+    size, placed / given      = s + x_ik           x: true size / given
     0                         = x_ik - m - t - o_i t: error of one tool, o: of one object, m: of all
     size, standard / given    = x_ik - g_ck        g: what the objects of one category share
 """
@@ -29,7 +28,6 @@ from mover.stages.posterior import Observations, least_squares
 
 DISTANCES = 0.1  # error that all given distances have in common, of the logarithm: as one's own
 TOOL = 0.04  # ... and all given sizes of a room: shapes of one tool fill their boxes similarly
-FILLED = 0.015  # error that the sizes share which the image finds, of shapes of a weight of 1
 FITTED = 0.06  # error of a logarithm of a distance or size that the image alone finds
 KIND = 0.5  # share of a standard's variance that the objects of one category have in common
 SEAT = 0.44  # [m], of a usual seat over the floor
@@ -75,9 +73,9 @@ def common_scale(
         return 0.0, 0.0
     count, kinds = len(categories), sorted(set(categories))
     kind = torch.tensor([kinds.index(name) for name in categories])
-    unknowns = torch.eye(5 + 4 * count + 3 * len(kinds), dtype=torch.float64)
-    scale, common, far, tool, filled = unknowns[:5]
-    own, true, usual = unknowns[5:].split((count, 3 * count, 3 * len(kinds)))
+    unknowns = torch.eye(4 + 4 * count + 3 * len(kinds), dtype=torch.float64)
+    scale, common, far, tool = unknowns[:4]
+    own, true, usual = unknowns[4:].split((count, 3 * count, 3 * len(kinds)))
     true = true.view(count, 3, -1)
     wide_of = {name: 1.0 if name in sources else math.inf for name in SOURCES}
     seen = Observations()
@@ -85,16 +83,14 @@ def common_scale(
     seen.add(common, 0.0, max(known.shared, 1e-6))
     seen.add(far, 0.0, DISTANCES)
     seen.add(tool, 0.0, TOOL)
-    seen.add(filled, 0.0, FILLED)
     seen.add(own, 0.0, COMMON)
     seen.add(usual, 0.0, 1.0, robust=True)
     if known.seats is not None:
-        seen.add(scale, known.seats[0], known.seats[1] * wide_of["seats"], robust=True)
+        seen.add(scale, known.seats[0], known.seats[1] * wide_of["seats"])
     away = (layout.t_world_object.norm(dim=-1) / given.distance).log()
     apart = math.hypot(AWAY, FITTED) * wide_of["distances"]
     seen.add((scale + common + far).expand(count, -1), away, apart, robust=True)
-    together = given.weight[:, None, None].double() * filled
-    seen.add(scale + together + true, layout.log_scale, FITTED)
+    seen.add(scale + true, layout.log_scale, FITTED)
     seen.add(true - common - tool - own[:, None], 0.0, SIZE * wide_of["sizes"])
     known_sizes = given.precision > 0
     wide = given.precision[known_sizes].double().rsqrt()
