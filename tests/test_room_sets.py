@@ -144,6 +144,10 @@ class TestPromises:
         assert trial.used[index]
         assert trial.used == tuple(k in furniture_in_use(room) for k in range(len(trial.used)))
         assert len(trial.capture.detections) == len(room.capture.detections) - 1
+        both = (torch.stack([b.frame, b.person], 1) for b in (trial.capture.bodies, room.bodies))
+        same = torch.cdist(*(keys.double() for keys in both)) == 0
+        assert same.sum(1).tolist() == [1] * len(trial.touching)
+        assert torch.equal(trial.touching, room.touching[same.int().argmax(1)])
 
     def test_rooms_are_used_and_their_noise_is_that_of_their_set(self, standard: KnownRoom) -> None:
         room = standard

@@ -200,6 +200,8 @@ def test_nearest_points_and_distances_are_those_of_naive_loops():
     naive = torch.cdist(query, points)
     assert torch.equal(index, naive.argmin(1))
     torch.testing.assert_close(distance, naive.amin(1), rtol=0, atol=1e-4)
+    both = torch.stack([query, query[:, [1, 2, 0]]])[None], torch.stack([points] * 2)[None]
+    assert torch.equal(nearest_points(*both)[1], torch.cdist(*both).argmin(-1))
     verts, faces = sphere([0.0, 0.0, 0.0], 1.0, level=5)
     found = to_surface(query * 3, verts, faces)
     torch.testing.assert_close(found, (query.norm(dim=-1) * 3 - 1).abs(), rtol=0, atol=2e-3)

@@ -70,7 +70,6 @@ def _subsets(preset: str, prefix: str) -> dict[str, Variant]:
 
 NO_WALLS = {s: replace(getattr(ROBUST, s), wall_alignment_steps=0) for s in ("layout", "place")}
 NOT_GIVEN = replace(ROBUST.layout, weights=replace(ROBUST.layout.weights, given=0.0))
-_IMAGE = weighted(PRESETS["paper"], contact=0.0, depth=0.0, collision=0.0)
 LISTS: dict[str, dict[str, Variant]] = {
     "ablation": {
         "robust": Variant(ROBUST),
@@ -89,7 +88,7 @@ LISTS: dict[str, dict[str, Variant]] = {
         "paper": Variant(PRESETS["paper"]),
         f"paper-{NO_TERM}": with_terms(PRESETS["paper"]),
         "true-contacts": Variant(PRESETS["paper"], "true contacts"),
-        f"true-contacts-{NO_TERM}": Variant(_IMAGE, "true contacts"),
+        f"true-contacts-{NO_TERM}": replace(with_terms(PRESETS["paper"]), given="true contacts"),
         "printed": Variant(PRESETS["printed"]),
         f"printed-{NO_TERM}": with_terms(PRESETS["printed"]),
     },

@@ -11,6 +11,7 @@ Sec. 3.1 and 3.2 of the paper: as printed (`paper`, with its `Readings`), and no
 """
 
 from dataclasses import fields
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -55,6 +56,11 @@ class DepthRange:
     far: Float[Tensor, "objects h w"]
     area: Float[Tensor, " objects"]
     """Area of a window pixel in pixels of an image that is 640 wide."""
+
+    @cached_property
+    def bounded(self) -> Bool[Tensor, "objects h w"]:
+        """Where there is a bound."""
+        return self.near.isfinite() | self.far.isfinite()
 
 
 @record
@@ -109,22 +115,19 @@ def depth_term(
     Paper: the sum over pixels; bounds that contradict each other are no range, unless they `count`.
     Robust: the mean over the constrained pixels, with 2 cm slack, clamped.
     """
-    ranged = (mask > 0.5) & (allowed.near.isfinite() | allowed.far.isfinite())
-    if form == "robust":
-        ranged = ranged & (allowed.near < allowed.far)
-    elif contradiction == "skip":
-        ranged = ranged & (allowed.near <= allowed.far)
+    robust, near, far = form == "robust", allowed.near, allowed.far
+    sane = near < far if robust else (near <= far) | (contradiction == "count")
+    ranged = (mask > 0.5) & allowed.bounded & sane
     item, pixel = ranged.flatten(1).nonzero(as_tuple=True)  # few pixels have bounds
-    near, far = (x.flatten(1)[item, pixel] for x in (allowed.near, allowed.far))
+    near, far = (x.flatten(1)[item, pixel] for x in (near, far))
     nearest, covered = (x.flatten(-2)[..., item, pixel] for x in (seen.nearest, seen.covered))
+    margin, limit = (DEPTH_MARGIN, CLAMP) if robust else (0.0, float("inf"))
+    out = _short(near - margin, nearest, limit) + _short(nearest, far + margin, limit)
     none = nearest.new_zeros(*nearest.shape[:-1], len(mask))
-    if form == "robust":
-        out = _short(near - DEPTH_MARGIN, nearest, CLAMP)
-        out = out + _short(nearest, far + DEPTH_MARGIN, CLAMP)
-        count = none.index_add(-1, item, covered.to(none)).clamp_min(FEWEST)
-        return none.index_add(-1, item, out * covered) / count
-    out = _short(near, nearest) + _short(nearest, far)
-    return none.index_add(-1, item, out * covered) * allowed.area
+    total = none.index_add(-1, item, out * covered)
+    if not robust:
+        return total * allowed.area
+    return total / none.index_add(-1, item, covered.to(none)).clamp_min(FEWEST)
 
 
 def _short(
@@ -259,7 +262,7 @@ def contact_distance(
     one to that of the back, if there is one. The pairing has no gradient.
     """
     real, parts = touches.weight > 0, torch.arange(4).to(touches.object_of)[:, None]
-    found, places = list[Tensor](), list[Tensor]()
+    flat = layout.yaw.new_zeros(*layout.yaw.shape[:-1], real.numel())
     for row, item in enumerate(touches.object_of.tolist()):
         t, scale = layout.t_world_object[..., item, None, :], layout.log_scale[..., item, None, :]
         turn, scale = rot_y(layout.yaw[..., item]), scale.exp()
@@ -273,11 +276,8 @@ def contact_distance(
             gap = query - (region[pair] * scale) @ turn.mT - t
             if components:
                 gap = gap * constant((1.0, 0.0, 1.0) if k else (0.0, 1.0, 0.0), gap)
-            found.append(safe_norm(gap))
-            places.append(asked.flatten().nonzero()[:, 0] + row * asked.numel())
-    flat = layout.yaw.new_zeros(*layout.yaw.shape[:-1], real.numel())
-    if found:
-        flat = flat.index_add(-1, torch.cat(places), torch.cat(found, -1))
+            places = asked.flatten().nonzero()[:, 0] + row * asked.numel()
+            flat = flat.index_add(-1, places, safe_norm(gap))
     return flat.unflatten(-1, real.shape)
 
 

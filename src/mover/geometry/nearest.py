@@ -16,13 +16,14 @@ def nearest_points(
     """
     from scipy.spatial import KDTree
 
+    if points.shape[-2] == 0:
+        raise ValueError("nearest_points: 'points' is empty, expected at least one point")
+    if query.is_cuda:  # a tree would fetch all points from the GPU, step by step
+        return torch.cdist(query, points, compute_mode="donot_use_mm_for_euclid_dist").min(-1)
     if query.ndim > 2:
         distance, index = zip(*map(nearest_points, query, points), strict=True)
         return torch.stack(distance), torch.stack(index)
-    if len(points) == 0:
-        raise ValueError("nearest_points: 'points' is empty, expected at least one point")
-    tree = KDTree(as_float64(points))
-    distance, index = tree.query(as_float64(query))
+    distance, index = KDTree(as_float64(points)).query(as_float64(query))
     return torch.from_numpy(distance).to(query), torch.from_numpy(index).to(query.device)
 
 
