@@ -185,6 +185,19 @@ def check_sane(capture: Capture) -> None:
         assert bool(detection.box.isfinite().all())
 
 
+@contextmanager
+def or_refused(counts: Counter[str], what: str, most: int = LONGEST) -> Iterator[None]:
+    """An `InputError` is read and counted, any other error fails; all within some seconds."""
+    try:
+        with limited(most):
+            yield
+    except InputError as error:
+        said(error)
+        counts["refused"] += 1
+    except Exception as error:
+        raise AssertionError(f"{what}: {error!r}") from error
+
+
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     folder = tiny.write_capture(tmp_path_factory.mktemp("fuzz") / "tiny")
@@ -201,17 +214,10 @@ def mutations(whole: Path, numbers: range) -> Counter[str]:
         shutil.copytree(whole, copy)
         rng = np.random.default_rng(number)
         what = KINDS[number % len(KINDS)](copy, rng)
-        try:
-            with limited(LONGEST):
-                capture = read_capture(copy)
-        except InputError as error:
-            said(error)
-            counts["refused"] += 1
-            continue
-        except Exception as error:
-            raise AssertionError(f"mutation {number} ({what}): {error!r}") from error
-        check_sane(capture)
-        counts["warned" if capture.warnings else "taken"] += 1
+        with or_refused(counts, f"mutation {number} ({what})"):
+            capture = read_capture(copy)
+            check_sane(capture)
+            counts["warned" if capture.warnings else "taken"] += 1
     return counts
 
 
@@ -220,7 +226,6 @@ def mutations(whole: Path, numbers: range) -> Counter[str]:
 ])  # fmt: skip
 def test_mutated_captures_are_taken_warned_of_or_refused(whole, numbers):
     counts = mutations(whole, numbers)
-    print(f"{len(numbers)} mutations of a capture: {dict(counts)}")  # noqa: T201
     assert sum(counts.values()) == len(numbers)
 
 
@@ -275,15 +280,8 @@ def read_pickles(home: Path, every: int, monkeypatch: pytest.MonkeyPatch) -> Cou
         path = sorted(p for p in folder.rglob("*") if p.is_file())[0]
         for name, content in list(bad.items())[number % every :: every]:
             path.write_bytes(content)
-            try:
-                with limited(LONGEST):
-                    read()
-            except InputError as error:
-                said(error)
-                counts["refused"] += 1
-            except Exception as error:
-                raise AssertionError(f"{tool}: {name}: {error!r}") from error
-            else:
+            with or_refused(counts, f"{tool}: {name}"):
+                read()
                 counts["taken"] += 1
             assert not mark.exists(), (tool, name)
     return counts
@@ -295,7 +293,6 @@ def read_pickles(home: Path, every: int, monkeypatch: pytest.MonkeyPatch) -> Cou
 ])  # fmt: skip
 def test_bad_pickles_are_refused_by_every_reader(tmp_path, monkeypatch, every, refused, read):
     counts = read_pickles(tmp_path, every, monkeypatch)
-    print(f"bad pickles x readers: {dict(counts)}")  # noqa: T201
     assert counts["refused"] >= refused
     assert sum(counts.values()) >= read
 
@@ -365,17 +362,8 @@ def test_every_setting_at_its_ends_runs_to_the_end(tmp_path, part, tiny):
     config, counts = light("robust", steps=2), Counter[str]()
     for way, span in itertools.islice(ways_of(config), part, None, 4):
         for value in {span.kind(v) for v in (-1, 0, span.low) if span.holds(span.kind(v))}:
-            try:
-                with limited(60):
-                    room = reconstruct(capture, with_value(config, way, value), Run(tmp_path))
-            except InputError as error:
-                said(error)
-                counts["refused"] += 1
-                continue
-            except Exception as error:
-                raise AssertionError(f"{'.'.join(way)} {value}: {error!r}") from error
-            for piece in room.scene.objects:
-                assert bool(piece.t_world_object.isfinite().all()), (way, value)
-            counts["ran"] += 1
-    print(f"settings at their ends: {dict(counts)}")  # noqa: T201
+            with or_refused(counts, f"{'.'.join(way)} {value}", 60):
+                room = reconstruct(capture, with_value(config, way, value), Run(tmp_path))
+                assert all(bool(one.t_world_object.isfinite().all()) for one in room.scene.objects)
+                counts["ran"] += 1
     assert counts["ran"] > 25

@@ -14,23 +14,8 @@ from mover.io.files.cameras import GUESSED
 from mover.perceive.capture import exif_focal, lens_of
 from mover.perceive.config import FramesConfig, Lens
 from mover.perceive.reference import LEAST, median
-from mover.perceive.steady import (
-    Drift,
-    align,
-    find_drift,
-    moved,
-    steady_frames,
-    warnings_of,
-    warp,
-)
-from mover.perceive.video import (
-    Clip,
-    TakeInputs,
-    read_picture,
-    stamp_of,
-    take_frames,
-    write_jpeg,
-)
+from mover.perceive.steady import Drift, align, find_drift, moved, steady_frames, warnings_of, warp
+from mover.perceive.video import Clip, TakeInputs, read_picture, stamp_of, take_frames, write_jpeg
 
 BEDROOM = Path(__file__).parents[2] / "shared" / "data" / "sam2_bedroom" / "bedroom.mp4"
 W, H = 320, 180

@@ -44,8 +44,7 @@ def offline(monkeypatch: pytest.MonkeyPatch) -> None:
 def folders(tmp_path_factory: pytest.TempPathFactory) -> ModelsConfig:
     base = tmp_path_factory.mktemp("models")
     return ModelsConfig(
-        masks=str(tiny_mask2former(base / "masks")),
-        keypoints=str(tiny_vitpose(base / "keypoints")),
+        masks=str(tiny_mask2former(base / "masks")), keypoints=str(tiny_vitpose(base / "keypoints"))
     )
 
 

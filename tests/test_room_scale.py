@@ -39,8 +39,10 @@ def test_furniture_shows_how_large_the_room_is(large: float) -> None:
     found = Layout(true.t_world_object * large, true.yaw, math.log(large) - off)
     given = gather_given(objects, start, found, torch.full((count,), 0.1))
     kinds = objects.categories
+    free, _ = common_scale(found, given, kinds, ScaleKnown((0.0, 1.0)))
+    assert abs(free - math.log(large)) < 0.03
     scale, spread = common_scale(found, given, kinds, ScaleKnown((0.0, 0.055)))
-    assert abs(scale - math.log(large)) < 0.03
+    assert scale == pytest.approx((1 - (spread / 0.055) ** 2) * free, abs=0.002)
     assert 0.01 < spread < 0.04  # of .055: what one tool gave is off together
     assert common_scale(found, given, kinds, ScaleKnown((0.0, 0.0))) == (0, 0)
     assert abs(common_scale(found, given, kinds, ScaleKnown((0.0, 0.005)))[0]) < 0.006
@@ -104,6 +106,8 @@ def test_more_seat_height_estimate_more() -> None:
     one, both = (seat_height_estimate(b, parts_of(b), ROOM) for b in (sitters, two))
     assert both[0] == pytest.approx(one[0], abs=1e-4)
     assert both[1] < one[1]
+    moved[6:] *= 1.3  # seats differ more than they usually do
+    assert seat_height_estimate(two, parts_of(sitters), ROOM)[1] > both[1]
 
 
 @pytest.mark.slow

@@ -88,6 +88,7 @@ TURNS = 1.0  # largest weight that counts for yaws
 ANY = 0.01  # and of those that are off by anything
 SIZE = 0.1  # of the logarithm of each given size
 COMMON = 0.06  # error that the three given sizes of an object have in common, as a logarithm
+KIND = 0.5  # share of a standard's variance that the objects of one category have in common
 
 
 @record
@@ -110,8 +111,6 @@ class Given:
     """How little the image constrains it: 1 is usual, 0 leaves it to the image."""
     placed: bool = True
     """Whether places, yaws and sizes were given; else axes and standard sizes alone are known."""
-
-    # What no layout changes is computed once: descents ask hundreds of times.
 
     @cached_property
     def log_distance(self) -> Float[Tensor, " objects"]:
@@ -138,10 +137,10 @@ def given_term(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]
     """How far positions, yaws and sizes are from what is expected [nats, times the weight]."""
     turns = given.weight.clamp_max(TURNS)
     if not given.placed:
-        return turns * (_axis(layout, given) + _student(_off_standard(layout, given)).sum(-1))
+        return turns * (_axis(layout, given) + student(_off_standard(layout, given)).sum(-1))
     yaw = given.unturned - _density(layout.yaw - given.yaw).log()
     turned = yaw + _axis(layout, given)
-    position = _student((_away(layout, given) / AWAY).square())
+    position = student((_away(layout, given) / AWAY).square())
     farther = _away(layout, given).unsqueeze(-1)
     kept = layout.log_scale.square().sum(-1) / SIZE**2
     seen = (layout.log_scale - farther).square().sum(-1) / SIZE**2
@@ -168,7 +167,7 @@ def _away(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
     return away - given.log_distance
 
 
-def _student(squares: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
+def student(squares: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
     """Of squared standard deviations, with three degrees of freedom."""
     return 2 * (1 + squares / 3).log()
 

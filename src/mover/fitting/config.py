@@ -28,10 +28,7 @@ class Stage:
     """Most iterations of L-BFGS."""
 
 
-PUBLISHED = (
-    Stage(4.78, 5, 4.78, 47.8, 0.1, 0),
-    Stage(4.78, 5, 4.78, 47.8, 2, 2),
-)
+PUBLISHED = (Stage(4.78, 5, 4.78, 47.8, 0.1, 0), Stage(4.78, 5, 4.78, 47.8, 2, 2))
 """The last two of the five stages of SMPLify-X's configuration for SMPL-X."""
 STAGES = (
     Stage(20.0, 5.0, 57.4, 574, 0.0, 0.0, steps=120),

@@ -76,7 +76,7 @@ def standing_on(picture: Picture, bodies: Bodies, run: Run) -> Picture:
     feet = run.stage(find_foot_contacts, standing, FootContactConfig())
     config = GUESSED if picture.tilt_spread is None else SEEN
     lean = POSES if picture.tilt_spread is None else 0.0
-    inputs = AlignInputs(feet, camera, None, None, lean=lean)
+    inputs = AlignInputs(feet, camera, None, None, lean=lean, level=False)  # see `camera_prior`
     found = run.stage(align_camera, inputs, config)
     if found.ground >= 0:
         return picture

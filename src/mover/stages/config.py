@@ -176,7 +176,7 @@ class RefineConfig:
     """Of what the image says."""
     uniform_scale_weight: Weight = GROWTH
     """Cost of another size as a whole, against that of another shape."""
-    method: Adam = field(default_factory=lambda: Adam(400, rate=0.3, last_rate=0.02, beta2=0.98))
+    method: Adam = field(default_factory=lambda: Adam(150, rate=0.3, last_rate=0.02, beta2=0.98))
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,6 @@ from mover.geometry.raster import Crops, fronts
 from mover.geometry.rle import decode, thinned
 from mover.geometry.warp_start import mapped
 
-# Which mask belongs to which body, decoded only when it is drawn.
-
 
 @dataclass(frozen=True)
 class MaskTable:
@@ -63,16 +61,6 @@ def mask_table(people: People, bodies: Bodies) -> MaskTable:
     return MaskTable(people.masks, own, others)
 
 
-# How far away upright people are: their height in the image less the width of their head.
-#
-# Not in the paper. A mask that is too wide by a few pixels all round adds as much to the height as
-# to the width of everything in it: the difference of both does not know it. An error of the pose,
-# which lowers the overlap of body and mask and so makes smaller, farther bodies look better,
-# changes the height of an upright person by its square only.
-#
-#     factor = median over frames of  (h_body - w_body) / (h_mask - w_mask)
-
-
 WHOLE = 0.01  # of the body's picture may be covered by objects or others, and no more
 UPRIGHT = 1.8  # times as high as wide
 HEAD = 0.125  # of the height
@@ -101,6 +89,9 @@ def compare_extents(
 ) -> Extents | None:
     """Compare the heights of a person's wholly seen bodies with those of their masks.
 
+    Not in the paper. A mask that is too wide all round adds as much to the height as to the width
+    of the head: their difference does not know it, and an error of the pose changes it by its
+    square only: factor = median over frames of (h_body - w_body) / (h_mask - w_mask).
     Blocked pixels are of what may hide people in a frame.
 
     Returns:

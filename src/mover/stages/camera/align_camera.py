@@ -37,6 +37,7 @@ ROUGH = 8  # steps are enough before the last scale
 FLAT = math.radians(45)  # [rad], no tilt is less certain than this
 WIDE = (1.0, 0.3)  # [m], first scales where the guess may be far off
 SIZE_PRIOR = 0.1  # [m], offset of people of a wrong size from the floor of a known height
+LEVEL = math.radians(8), math.radians(2)  # [rad], pitch and roll on shelves and tripods
 UNKNOWN_HEIGHT = 1.5  # [m], of a camera about which nothing is known
 LOOSE_TILT, LOOSE_GROUND = math.radians(1.0), 0.03  # [rad], [m], spreads that deserve a warning
 NARROW = 0.3  # [m], a walk that is less wide is a line
@@ -274,6 +275,8 @@ class AlignInputs:
     """How far the plane under the feet may lean as a whole, an error that all feet share [rad]."""
     size: float = 0.0
     """Standard deviation of the logarithm of the people's size, which moves the floor with them."""
+    level: bool = True
+    """Whether fitted bodies are combined with how level cameras stand (`LEVEL`)."""
 
 
 @record
@@ -349,10 +352,12 @@ def _with_lean(
     middle = (votes.weight[:, None] * slope[:, :2]).sum(0) / votes.weight.sum()
     turns = torch.cat([torch.eye(2, dtype=torch.float64), middle[:, None]], 1)
     covariance = covariance + CAUTION * inputs.lean**2 * turns.mT @ turns
-    if inputs.tilt_spread is None:
+    if inputs.tilt_spread is None and not inputs.level:
         return at, covariance
-    spreads = first.new_tensor([inputs.tilt_spread, inputs.tilt_spread, torch.inf])
-    known = diagonal(torch.cat([first, first.new_zeros(1)]), spreads)
+    level, given = first.new_tensor(LEVEL), inputs.tilt_spread
+    off = (at[:2] - first) / level
+    spreads = level * (1 + off.square() / TILT_TAIL).sqrt() if given is None else 0 * off + given
+    known = diagonal(torch.cat([first, 0 * first[:1]]), torch.cat([spreads, torch.inf + first[:1]]))
     both = Gaussian(at[:3], torch.linalg.inv(covariance)).times(known)
     return torch.cat([both.mean, at[3:]]), both.covariance
 

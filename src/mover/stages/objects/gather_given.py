@@ -228,20 +228,6 @@ def room_axis(
     return math.atan2(y, x) / 4, math.sqrt(-2 * math.log(length)) / 4
 
 
-# How far the initial sizes of a room's furniture are off, from its image (not in the paper).
-#
-# The cost of sizes (the scale term) suits tools whose sizes err as much as usual. Where the image
-# alone changes the shapes of a room's furniture more than that, the sizes that it cannot
-# constrain (the depth of a cabinet that is seen from the front) are weighted less too. Logarithms
-# of the three sizes of an object are c + e_k, with c common (an object that was placed too far
-# was made too large) and e_k independent; then the cost of a normal distribution is
-#
-#     \sum_k (l_k - m)^2 / v + 3 m^2 / (v + 3 w),   m = mean l_k,  v = var e_k,  w = var c,
-#
-# of which v is learnt from the room (empirical Bayes) and w is not. An object whose silhouette
-# cannot be made to fit (another shape, a bad mask) changes its sizes whether they are wrong or
-# not, so it counts by the square of the weight of its silhouette.
-
 WIDEST = 4.0  # largest spread that is learnt, in usual ones; the smallest is 1
 LIGHTEST = 0.1  # of the weight of a silhouette that fits
 
@@ -258,7 +244,16 @@ def inlier_weights(energy: Float[Tensor, " objects"]) -> Float[Tensor, " objects
 def estimate_size_prior(
     layout: Layout, trust: Float[Tensor, " objects"], config: SpreadConfig
 ) -> tuple[float, float]:
-    """Factors on the cost of another shape, and on that of another size as a whole."""
+    r"""Factors on the cost of another shape, and on that of another size as a whole.
+
+    Not in the paper. Where the image alone changes shapes more than usual, the sizes that it cannot
+    constrain (the depth of a cabinet seen from the front) are weighted less. The logarithms of an
+    object's sizes are c + e_k with c common (what was placed too far was made too large):
+
+        \sum_k (l_k - m)^2 / v + 3 m^2 / (v + 3 w),   m = mean l_k,  v = var e_k,  w = var c,
+
+    v is learnt from the room (empirical Bayes), in which shapes that do not fit count less.
+    """
     if config.usual <= 0:
         return 1.0, 1.0
     log_scale, usual, share = layout.log_scale, config.usual**2, trust.square()

@@ -24,11 +24,6 @@ from mover.geometry.warp_start import threads
 from mover.geometry.watertight import close_mesh
 from mover.stages.config import PrepareConfig
 
-# Which parts of furniture people touch (supplement, "Contact Regions of Objects").
-#
-# Sofas and chairs are touched at the seat and the back, beds, tables and the rest on their top. The
-# parts follow from the normals of even surface points: up for seats and tops, forward for backs.
-
 UPRIGHT = 0.866  # cosine of 30 degrees: normals of a seat or a back
 MISSING = 0.15  # of the height: a corner that hangs higher has no foot
 LEVEL = 0.005  # of the height: feet that differ by less stand level
@@ -43,6 +38,7 @@ def find_regions(
 ) -> tuple[Float[Tensor, "tops 3"], Float[Tensor, "backs 3"]]:
     """Surface points of the seat or top, and of the back, in the object's frame [m].
 
+    Supplement, "Contact Regions of Objects": normals are up on seats and tops, forward on backs.
     The seat is the largest level layer above a quarter of the height, so that neither arms nor the
     back's rim count; a top is the highest layer with a quarter of the largest one's area. By
     `normals` all that looks upward is the seat or top, and all that looks forward the back.

@@ -7,7 +7,7 @@ for legs. All of it is one least-squares problem in logarithms, each line with a
 
     people: s = how much larger than theirs,   seats: s = how much too high people sit
     distance, placed / given  = s + m + d          d: error that all given distances share
-    size, placed / given      = s + x_ik           x: true size / given
+    size, placed / given      = s + f + x_ik       x: true size / given, f: all placed sizes
     0                         = x_ik - m - t - o_i t: error of one tool, o: of one object, m: of all
     size, standard / given    = x_ik - g_ck        g: what the objects of one category share
 """
@@ -23,17 +23,18 @@ from mover.bodies.parts import BodyParts, members
 from mover.bodies.posture import at, landmarks, postures
 from mover.core.records import record
 from mover.core.types import Bodies, Layout
-from mover.energy.prior_terms import AWAY, COMMON, SIZE, Given
+from mover.energy.prior_terms import AWAY, COMMON, KIND, SIZE, Given
 from mover.stages.posterior import Observations, least_squares
 
 DISTANCES = 0.1  # error that all given distances have in common, of the logarithm: as one's own
 TOOL = 0.04  # ... and all given sizes of a room: shapes of one tool fill their boxes similarly
+FILLED = 0.03  # ... and all sizes as placed: wrong shapes grow behind occluders
 FITTED = 0.06  # error of a logarithm of a distance or size that the image alone finds
-KIND = 0.5  # share of a standard's variance that the objects of one category have in common
 SEAT = 0.44  # [m], of a usual seat over the floor
 SEATS = 0.06  # standard deviation of its logarithm: chairs .43-.47, sofas .40-.45, offices .42-.50
 POSES = 0.04  # the same of how high people seem to sit: all their poses err together
 CARRIED = ("seat", "left_thigh", "right_thigh")  # of a seated person
+USUAL = 2.0  # seats that SEATS is worth when the spread of a room's seats is estimated
 LOWEST = 0.1  # share of a sitter's points below the top of the seat
 SAME = 0.3  # [m] between two who sit on one seat
 FEWEST = 3  # bodies that give the height of a seat
@@ -73,9 +74,9 @@ def common_scale(
         return 0.0, 0.0
     count, kinds = len(categories), sorted(set(categories))
     kind = torch.tensor([kinds.index(name) for name in categories])
-    unknowns = torch.eye(4 + 4 * count + 3 * len(kinds), dtype=torch.float64)
-    scale, common, far, tool = unknowns[:4]
-    own, true, usual = unknowns[4:].split((count, 3 * count, 3 * len(kinds)))
+    unknowns = torch.eye(5 + 4 * count + 3 * len(kinds), dtype=torch.float64)
+    scale, common, far, tool, filled = unknowns[:5]
+    own, true, usual = unknowns[5:].split((count, 3 * count, 3 * len(kinds)))
     true = true.view(count, 3, -1)
     wide_of = {name: 1.0 if name in sources else math.inf for name in SOURCES}
     seen = Observations()
@@ -83,6 +84,7 @@ def common_scale(
     seen.add(common, 0.0, max(known.shared, 1e-6))
     seen.add(far, 0.0, DISTANCES)
     seen.add(tool, 0.0, TOOL)
+    seen.add(filled, 0.0, FILLED)
     seen.add(own, 0.0, COMMON)
     seen.add(usual, 0.0, 1.0, robust=True)
     if known.seats is not None:
@@ -90,7 +92,8 @@ def common_scale(
     away = (layout.t_world_object.norm(dim=-1) / given.distance).log()
     apart = math.hypot(AWAY, FITTED) * wide_of["distances"]
     seen.add((scale + common + far).expand(count, -1), away, apart, robust=True)
-    seen.add(scale + true, layout.log_scale, FITTED)
+    unfit = given.weight.double().clamp_max(1.0)[:, None, None]
+    seen.add(scale + unfit * filled + true, layout.log_scale, FITTED)
     seen.add(true - common - tool - own[:, None], 0.0, SIZE * wide_of["sizes"])
     known_sizes = given.precision > 0
     wide = given.precision[known_sizes].double().rsqrt()
@@ -125,8 +128,9 @@ def seat_height_estimate(
     heights = [h for h in heights if float(h) > 0]
     if not heights:
         return None
-    spread = (SEATS**2 / len(heights) + POSES**2) ** 0.5
-    return float((torch.stack(heights) / SEAT).log().mean()), spread
+    off = (torch.stack(heights) / SEAT).log()
+    apart = (SEATS**2 * USUAL + float((off - off.mean()).square().sum())) / (USUAL + len(off) - 1)
+    return float(off.mean()), (apart / len(off) + POSES**2) ** 0.5
 
 
 def _places(points: Float[Tensor, "rows 2"]) -> list[Bool[Tensor, " rows"]]:

@@ -45,10 +45,8 @@ from mover.stages.masks import (
 )
 
 # Errors of the pose bias both factors as far as bodies cannot be made to fill their masks: the
-# misfit, one minus the best overlap. Learnt on development rooms of the known rooms with pose
-# errors of 0, 4 and 8 degrees a joint (seeds 100 to 129): overlaps put people too far, by 1 % from
-# a misfit of 0.3 on; heights, since bent bodies are lower, put them too near by 1 % there and by
-# more beyond.
+# misfit, one minus the best overlap. Learnt on known rooms: overlaps put people too far, by 1 %
+# from a misfit of 0.3 on; heights, as bent bodies are lower, too near by 1 % there and more beyond.
 
 SYSTEMATIC = 0.003  # error of the factor that more frames do not make smaller
 
