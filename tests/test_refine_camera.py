@@ -38,11 +38,8 @@ def wrong_camera():
         replace(ROBUST.layout, yaws=1, short=Adam(0)),
     )
     feet = torch.stack([*pitch_roll(camera.R_cam_world), torch.tensor(ground)])
-    found = RefineInputs(
-        camera, ground, Gaussian(feet, torch.linalg.inv(LOOSE)), objects, inputs.image,
-        fitted.layout,
-    )  # fmt: skip
-    return inputs.camera, found
+    prior = Gaussian(feet, torch.linalg.inv(LOOSE))
+    return inputs.camera, RefineInputs(camera, ground, prior, objects, inputs.image, fitted.layout)
 
 
 def errors(camera, truth):

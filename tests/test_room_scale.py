@@ -40,8 +40,8 @@ def test_furniture_shows_how_large_the_room_is(large: float) -> None:
     given = gather_given(objects, start, found, torch.full((count,), 0.1))
     kinds = objects.categories
     free, _ = common_scale(found, given, kinds, ScaleKnown((0.0, 1.0)))
-    assert abs(free - math.log(large)) < 0.03
     scale, spread = common_scale(found, given, kinds, ScaleKnown((0.0, 0.055)))
+    assert abs(scale - math.log(large)) < 0.03
     assert scale == pytest.approx((1 - (spread / 0.055) ** 2) * free, abs=0.002)
     assert 0.01 < spread < 0.04  # of .055: what one tool gave is off together
     assert common_scale(found, given, kinds, ScaleKnown((0.0, 0.0))) == (0, 0)

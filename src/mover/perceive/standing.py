@@ -17,7 +17,7 @@ from mover.core.run import Run
 from mover.core.types import Bodies
 from mover.geometry.camera import pitch_roll, tilted
 from mover.perceive.layout import Picture
-from mover.stages.camera.align_camera import AlignInputs, Alignment, align_camera
+from mover.stages.camera.align_camera import LEVEL, AlignInputs, Alignment, align_camera
 from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
 from mover.stages.camera.find_lens import MEASURED, heading_of, tilt_of, tilted_by
 from mover.stages.camera.room_lines import SURE, Prior, find_segments, fit_room
@@ -27,10 +27,9 @@ from mover.stages.posterior import Gaussian, diagonal
 
 POSES = math.radians(2.0)  # [rad] by which a floor under fitted bodies leans: feet err together
 HEIGHTS = 0.05  # of the logarithm of the floor's depth, beside the size of the people
-PITCH, ROLL = math.radians(8.0), math.radians(2.0)  # [rad] how cameras on shelves and tripods look
 GIVEN = 0.02  # of the logarithm of a given height of the camera
 SEEN = AlignConfig(tilt_prior=math.radians(0.03))  # a tilt from edges stays: feet err more
-GUESSED = AlignConfig(tilt_prior=PITCH)  # a camera of unknown tilt looks anywhere
+GUESSED = AlignConfig(tilt_prior=LEVEL[0])  # a camera of unknown tilt looks anywhere
 
 
 def seen_from(picture: Picture, bodies: Bodies | None, run: Run) -> Picture:
@@ -76,7 +75,7 @@ def standing_on(picture: Picture, bodies: Bodies, run: Run) -> Picture:
     feet = run.stage(find_foot_contacts, standing, FootContactConfig())
     config = GUESSED if picture.tilt_spread is None else SEEN
     lean = POSES if picture.tilt_spread is None else 0.0
-    inputs = AlignInputs(feet, camera, None, None, lean=lean, level=False)  # see `camera_prior`
+    inputs = AlignInputs(feet, camera, None, None, lean=lean)
     found = run.stage(align_camera, inputs, config)
     if found.ground >= 0:
         return picture
@@ -101,7 +100,7 @@ def camera_prior(found: Alignment, picture: Picture, size: float) -> Gaussian:
     before = [float(x) for x in pitch_roll(picture.camera.R_cam_world.double())]
     usual = torch.tensor([*before, math.log(picture.height or height)], dtype=torch.float64)
     known = math.inf if picture.height is None else GIVEN
-    spreads = (PITCH, ROLL) if picture.tilt_spread is None else (picture.tilt_spread,) * 2
+    spreads = LEVEL if picture.tilt_spread is None else (picture.tilt_spread,) * 2
     prior = diagonal(usual, torch.tensor([*spreads, known], dtype=torch.float64))
     both = Gaussian(observed, torch.linalg.inv(covariance)).times(prior)
     return Gaussian(both.mean.float(), both.precision.float())

@@ -142,7 +142,7 @@ _ROBUST_FULL = SceneWeights(
 ROBUST = Config(
     lens=LensConfig(use=True),
     correct_depth=True,
-    foot_contacts=FootContactConfig(speed=0.6),
+    foot_contacts=FootContactConfig(speed=0.6), align=AlignConfig(level=True),
     prepare=PrepareConfig(level_feet=True),
     image=ImageConfig(
         128, "robust", hidden=0.2, bounded=True, borders=(-1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5)

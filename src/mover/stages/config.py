@@ -88,6 +88,8 @@ class AlignConfig:
     together, by their mean."""
     steps: Annotated[int, int_in(0, 10_000)] = 60
     """Most Gauss-Newton steps for each scale; 0: the camera stays as it is given."""
+    level: bool = False
+    """Whether fitted bodies, which may lean, are combined with how level cameras stand."""
 
 
 @dataclass(frozen=True)

@@ -89,10 +89,8 @@ def compare_extents(
 ) -> Extents | None:
     """Compare the heights of a person's wholly seen bodies with those of their masks.
 
-    Not in the paper. A mask that is too wide all round adds as much to the height as to the width
-    of the head: their difference does not know it, and an error of the pose changes it by its
-    square only: factor = median over frames of (h_body - w_body) / (h_mask - w_mask).
-    Blocked pixels are of what may hide people in a frame.
+    factor = median over frames of (h_body - w_body) / (h_mask - w_mask), w of the head: a mask that
+    is too wide all round cancels. Blocked pixels are of what may hide people in a frame (ours).
 
     Returns:
         None if no person is seen wholly, upright and high enough.

@@ -275,8 +275,6 @@ class AlignInputs:
     """How far the plane under the feet may lean as a whole, an error that all feet share [rad]."""
     size: float = 0.0
     """Standard deviation of the logarithm of the people's size, which moves the floor with them."""
-    level: bool = True
-    """Whether fitted bodies are combined with how level cameras stand (`LEVEL`)."""
 
 
 @record
@@ -322,7 +320,7 @@ def align_camera(
     free = dataclasses.replace(inputs, tilt_spread=None) if inputs.lean else inputs
     fit = _best_fit(free, config, votes, first)
     observe(Step("align_camera", 0, 1))
-    at, spread = _with_lean(fit, votes, inputs, first)
+    at, spread = _with_lean(fit, votes, inputs, first, level=config.level)
     if inputs.camera_height is None:  # people who are larger are farther, and so is their floor
         spread[2, 2] += (inputs.size * at[2]) ** 2
     people = [str(p) for p in votes.people.tolist()]
@@ -338,7 +336,7 @@ def align_camera(
 
 
 def _with_lean(
-    fit: PlaneFit, votes: Votes, inputs: AlignInputs, first: Float[Tensor, "2"]
+    fit: PlaneFit, votes: Votes, inputs: AlignInputs, first: Float[Tensor, "2"], *, level: bool
 ) -> tuple[Float[Tensor, " unknowns"], Float[Tensor, "3 3"]]:
     """The minimum and its covariance with a lean that all feet share, beside a known tilt.
 
@@ -352,12 +350,15 @@ def _with_lean(
     middle = (votes.weight[:, None] * slope[:, :2]).sum(0) / votes.weight.sum()
     turns = torch.cat([torch.eye(2, dtype=torch.float64), middle[:, None]], 1)
     covariance = covariance + CAUTION * inputs.lean**2 * turns.mT @ turns
-    if inputs.tilt_spread is None and not inputs.level:
+    if inputs.tilt_spread is not None:
+        spreads = torch.full_like(first, inputs.tilt_spread)
+    elif level:
+        usual = first.new_tensor(LEVEL)
+        spreads = usual * (1 + ((at[:2] - first) / usual).square() / TILT_TAIL).sqrt()
+    else:
         return at, covariance
-    level, given = first.new_tensor(LEVEL), inputs.tilt_spread
-    off = (at[:2] - first) / level
-    spreads = level * (1 + off.square() / TILT_TAIL).sqrt() if given is None else 0 * off + given
-    known = diagonal(torch.cat([first, 0 * first[:1]]), torch.cat([spreads, torch.inf + first[:1]]))
+    wide = torch.nn.functional.pad(spreads, (0, 1), value=torch.inf)  # but for the ground
+    known = diagonal(torch.cat([first, first.new_zeros(1)]), wide)
     both = Gaussian(at[:3], torch.linalg.inv(covariance)).times(known)
     return torch.cat([both.mean, at[3:]]), both.covariance
 

@@ -104,10 +104,8 @@ def refine_camera(
     pitch, roll = pitch_roll(inputs.camera.R_cam_world)
     tilt = torch.stack([pitch, roll, pitch.new_tensor(inputs.ground)])
     kinds = sorted(set(objects.categories))
-    kind = torch.tensor([kinds.index(name) for name in objects.categories], device=tilt.device)
-    fixed = _Joint(
-        tilt, rays, inputs.layout.yaw, inputs.layout.log_scale, tilt.new_zeros(len(kinds))
-    )  # fmt: skip
+    kind, shared = [kinds.index(name) for name in objects.categories], tilt.new_zeros(len(kinds))
+    fixed = _Joint(tilt, rays, inputs.layout.yaw, inputs.layout.log_scale, shared)
     mean, certainty = inputs.feet.mean.to(tilt), inputs.feet.precision.to(tilt)
     cues = fixed_borders(inputs.image, inputs.layout, objects, inputs.camera, config.weights)
     terms = SceneConfig(config.weights, "robust", config.uniform_scale_weight)

@@ -246,9 +246,8 @@ def estimate_size_prior(
 ) -> tuple[float, float]:
     r"""Factors on the cost of another shape, and on that of another size as a whole.
 
-    Not in the paper. Where the image alone changes shapes more than usual, the sizes that it cannot
-    constrain (the depth of a cabinet seen from the front) are weighted less. The logarithms of an
-    object's sizes are c + e_k with c common (what was placed too far was made too large):
+    Not in the paper: where the image alone changes shapes more than usual, sizes that it cannot
+    constrain are weighted less. Logarithms of an object's sizes are c + e_k with c common:
 
         \sum_k (l_k - m)^2 / v + 3 m^2 / (v + 3 w),   m = mean l_k,  v = var e_k,  w = var c,
 

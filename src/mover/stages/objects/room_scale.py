@@ -7,7 +7,7 @@ for legs. All of it is one least-squares problem in logarithms, each line with a
 
     people: s = how much larger than theirs,   seats: s = how much too high people sit
     distance, placed / given  = s + m + d          d: error that all given distances share
-    size, placed / given      = s + f + x_ik       x: true size / given, f: all placed sizes
+    size, placed / given      = s + w_i f + x_ik   x: true size / given, w: how little shapes fit
     0                         = x_ik - m - t - o_i t: error of one tool, o: of one object, m: of all
     size, standard / given    = x_ik - g_ck        g: what the objects of one category share
 """
@@ -28,7 +28,7 @@ from mover.stages.posterior import Observations, least_squares
 
 DISTANCES = 0.1  # error that all given distances have in common, of the logarithm: as one's own
 TOOL = 0.04  # ... and all given sizes of a room: shapes of one tool fill their boxes similarly
-FILLED = 0.03  # ... and all sizes as placed: wrong shapes grow behind occluders
+FILLED = 0.015  # ... and sizes as placed, of shapes of a weight of 1 (`prior_weights`)
 FITTED = 0.06  # error of a logarithm of a distance or size that the image alone finds
 SEAT = 0.44  # [m], of a usual seat over the floor
 SEATS = 0.06  # standard deviation of its logarithm: chairs .43-.47, sofas .40-.45, offices .42-.50
@@ -92,7 +92,7 @@ def common_scale(
     away = (layout.t_world_object.norm(dim=-1) / given.distance).log()
     apart = math.hypot(AWAY, FITTED) * wide_of["distances"]
     seen.add((scale + common + far).expand(count, -1), away, apart, robust=True)
-    unfit = given.weight.double().clamp_max(1.0)[:, None, None]
+    unfit = given.weight[:, None, None].double()
     seen.add(scale + unfit * filled + true, layout.log_scale, FITTED)
     seen.add(true - common - tool - own[:, None], 0.0, SIZE * wide_of["sizes"])
     known_sizes = given.precision > 0
