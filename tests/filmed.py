@@ -5,7 +5,7 @@ which is turned, cut or taken at another time gives other masks and joints.
 """
 
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
@@ -20,9 +20,16 @@ from mover.core.observe import Observer, silent
 from mover.core.types import Keypoints, Masks, People
 from mover.geometry.rle import decode, encode, tight_box
 from mover.perceive.capture import Finders
-from mover.perceive.config import ModelsConfig, PerceiveConfig
-from mover.perceive.networks import PERSON, DetectInputs, Finds, JointsInputs
-from mover.perceive.video import Clip, read_picture
+from mover.perceive.config import FramesConfig, ModelsConfig, PerceiveConfig
+from mover.perceive.networks import PERSON, Finds, JointsInputs
+from mover.perceive.video import (
+    Clip,
+    TakeInputs,
+    read_picture,
+    stamp_of,
+    take_frames,
+    write_jpeg,
+)
 
 COLOURS = {PERSON: (225, 30, 200), "chair": (20, 190, 60)}
 W, H = 128, 96
@@ -84,8 +91,8 @@ def walk(time: float) -> float:
 
 def write_film(
     path: Path, pictures: Iterable[Pixels], times: Iterable[int], rate: int = 30
-) -> None:
-    """An MP4 whose pictures have these time stamps, in 1/rate seconds."""
+) -> Path:
+    """A film (.mp4) whose pictures have these time stamps, in 1/rate seconds."""
     av = pytest.importorskip("av")
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=rate)
@@ -98,13 +105,12 @@ def write_film(
             frame.pts, frame.time_base = time, Fraction(1, rate)
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
-
-
-def filmed(path: Path, shot: Shot, times: Iterable[int], rate: int = 30) -> Path:
-    """A film of one shot."""
-    stamps = list(times)
-    write_film(path, (shot.at(t / rate) for t in stamps), stamps, rate)
     return path
+
+
+def filmed(path: Path, shot: Shot, times: Sequence[int], rate: int = 30) -> Path:
+    """A film of one shot."""
+    return write_film(path, (shot.at(t / rate) for t in times), times, rate)
 
 
 def turned_film(path: Path, pictures: list[Pixels], times: Iterable[int], turns: int) -> Path:
@@ -127,21 +133,32 @@ def turned_film(path: Path, pictures: list[Pixels], times: Iterable[int], turns:
     return path
 
 
-def mask_of(clip: Clip, frame: int, category: str) -> torch.Tensor:
-    """Pixels of a colour."""
-    picture = read_picture(clip.path(frame)).astype(int)
-    return torch.from_numpy(np.abs(picture - COLOURS[category]).max(-1) < NEAR)
+def take(source: Path, folder: Path, config: FramesConfig | None = None) -> Clip:
+    """The frames that the program takes of a film or a folder."""
+    return take_frames(TakeInputs(source, stamp_of(source), folder), config or FramesConfig())
 
 
-def instances(inputs: DetectInputs, _config: PerceiveConfig, _observe: Observer = silent) -> Finds:
+def clip_of(folder: Path, pictures: Iterable[Pixels]) -> Clip:
+    """Pictures as the frames of a clip, five a second."""
+    folder.mkdir(exist_ok=True)
+    sizes = list[tuple[int, ...]]()
+    for k, picture in enumerate(pictures):
+        write_jpeg(np.ascontiguousarray(picture), folder / f"{k:06d}.jpg")
+        sizes.append(picture.shape)
+    h, w, _ = sizes[0]
+    return Clip(str(folder), w, h, torch.arange(len(sizes)) / 5, 5.0)
+
+
+def instances(clip: Clip, _config: PerceiveConfig, _observe: Observer = silent) -> Finds:
     """Whatever has the colour of a person or a chair."""
-    found = [
-        (frame, category, mask)
-        for frame in inputs.frames
-        for category in COLOURS
-        if int((mask := mask_of(inputs.clip, frame, category)).sum()) > 100
-    ]
-    masks = Masks(inputs.clip.height, inputs.clip.width, tuple(encode(m) for *_, m in found))
+    found = list[tuple[int, str, torch.Tensor]]()
+    for frame in range(len(clip.time)):
+        picture = read_picture(clip.path(frame)).astype(int)
+        for category, colour in COLOURS.items():
+            mask = torch.from_numpy(np.abs(picture - colour).max(-1) < NEAR)
+            if int(mask.sum()) > 100:
+                found.append((frame, category, mask))
+    masks = Masks(clip.height, clip.width, tuple(encode(m) for *_, m in found))
     frames = torch.tensor([frame for frame, *_ in found], dtype=torch.long)
     return Finds(masks, frames, tuple(c for _, c, _ in found), torch.full((len(found),), 0.9))
 

@@ -9,16 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from filmed import clip_of
 
 from mover.app.cli import run_command
 from mover.bodies.keypoints import LAYOUTS
 from mover.core.errors import InputError
-from mover.core.types import Masks
+from mover.core.types import Keypoints, Masks, People
 from mover.geometry.rle import decode, encode
 from mover.perceive import mediapipe, needs
-from mover.perceive.config import FramesConfig, ModelsConfig
+from mover.perceive.config import ModelsConfig
 from mover.perceive.reference import Clean
-from mover.perceive.video import Clip, read_frames, write_jpeg
+from mover.perceive.video import Clip, read_frames
 
 CLIPS = Path(__file__).parents[2] / "shared" / "data" / "clips"
 H, W = 240, 320
@@ -77,12 +78,10 @@ def crowd(*people: tuple[float, float]) -> np.ndarray:
 
 def test_several_people_are_found_upright_in_the_pixels_of_the_picture(tmp_path, monkeypatch):
     one, two = PEOPLE
-    for k, people in enumerate([(one, two), (two,), (), (one, two)]):
-        write_jpeg(crowd(*people), tmp_path / f"{k:06d}.jpg")
-    monkeypatch.setattr(mediapipe, "loaded", {"d": detector, "l": landmarks}.__getitem__)
-    clip = Clip(str(tmp_path), W, H, torch.arange(4) / 5, 5.0)
-    found = mediapipe.find_poses(mediapipe.PoseInputs(clip, ("d", "l"), ""))
-    assert found.frame.tolist() == [0, 0, 1, 3, 3]
+    pictures = [crowd(*people) for people in ((one, two), (two,), (), (one, two))]
+    tracks, found = poses_in(clip_of(tmp_path, pictures), monkeypatch)
+    assert found.frame.tolist() == tracks.frame.tolist() == [0, 0, 1, 3, 3]
+    assert found.person.equal(tracks.person)
     middle = found.points[:, 5]
     names = {one: 0, two: 1} if float(middle[0, 0]) < 160 else {one: 1, two: 0}
     assert found.person.tolist() == [0, 1, names[two], *found.person.tolist()[3:]]
@@ -96,9 +95,20 @@ def test_several_people_are_found_upright_in_the_pixels_of_the_picture(tmp_path,
         moved = (at[0] + 8 / 256 * side, at[1])
         assert found.points[k, 1].tolist() == pytest.approx(moved, abs=0.6)
         true = torch.from_numpy(crowd(at)[..., 0] > 127)
-        mask = decode(found.masks, k)
+        mask = decode(tracks.masks, k)
         assert float((mask & true).sum() / (mask | true).sum()) > 0.9
     assert found.confidence.flatten().tolist() == pytest.approx([0.8] * 5 * 33)
+
+
+def poses_in(clip: Clip, monkeypatch: pytest.MonkeyPatch) -> tuple[People, Keypoints]:
+    monkeypatch.setattr(mediapipe, "loaded", {"d": detector, "l": landmarks}.__getitem__)
+    return mediapipe.find_poses(mediapipe.PoseInputs(clip, ("d", "l"), ""))
+
+
+def joints_at(points: torch.Tensor) -> Keypoints:
+    """The landmarks of a person in one frame."""
+    zero = torch.tensor([0])
+    return Keypoints(points, torch.ones(1, 33), "mediapipe33", zero, zero, 5.0)
 
 
 def test_masks_lose_the_furniture_that_no_limb_is_near_to():
@@ -112,15 +122,13 @@ def test_masks_lose_the_furniture_that_no_limb_is_near_to():
     body = ((x - 160).abs() < 10) & (y > 10) & (y < 228)
     chair = (x > 150) & (x < 260) & (y > 130) & (y < 220)
     masks = Masks(H, W, (encode(body | chair | ((x > 280) & (y > 200))),))
-    poses = mediapipe.Poses(
-        masks, torch.from_numpy(points).float(), torch.ones(1, 33), torch.tensor([0]),
-        torch.tensor([0]),
-    )  # fmt: skip
-    found = decode(mediapipe.without_furniture(poses, chair).masks, 0)
+    joints = joints_at(torch.from_numpy(points).float())
+    tracks = People(masks, joints.frame, joints.person)
+    found = decode(mediapipe.without_furniture(tracks, joints, chair).masks, 0)
     assert bool((found & body).sum() == body.sum())  # what is near to a limb stays
     assert not bool(found[:, 200:260].any())  # of the chair nothing else
     assert bool(found[220, 300])  # what is no furniture stays
-    none = mediapipe.without_furniture(poses, torch.zeros(H, W, dtype=torch.bool))
+    none = mediapipe.without_furniture(tracks, joints, torch.zeros(H, W, dtype=torch.bool))
     assert none.masks.counts == masks.counts
 
 
@@ -132,40 +140,32 @@ def test_landmarks_where_a_frame_shows_the_empty_room_are_not_seen(tmp_path: Pat
     frame = room + noise + 6  # it became lighter
     frame[10:228, 140:180] = 30
     frame[190:205, 225:240] = 30  # a foot before the chair
-    write_jpeg(frame.astype(np.uint8), tmp_path / "000000.jpg")
     points = torch.full((1, 33, 2), 160.0)
     points[0, :, 1] = torch.linspace(25, 215, 33)
     points[0, 25], points[0, 27], points[0, 28], points[0, 31] = torch.tensor(
         [[215.0, 150], [215, 200], [232, 197], [290, 225]]
     )
     points[0, 1] = torch.tensor([-20.0, 50])  # outside nothing is known
-    poses = mediapipe.Poses(
-        Masks(H, W, (encode(torch.ones(H, W, dtype=torch.bool)),)), points, torch.ones(1, 33),
-        torch.tensor([0]), torch.tensor([0]),
-    )  # fmt: skip
-    clip = Clip(str(tmp_path), W, H, torch.zeros(1), None)
+    joints = joints_at(points)
+    clip = clip_of(tmp_path, [frame.astype(np.uint8)])
     chair = torch.zeros(H, W, dtype=torch.bool)
     chair[130:220, 200:260] = True
     clean = Clean(torch.from_numpy(room).float() / 255, chair)  # always under the man's mask
     for furniture, gone in ((chair, [25, 27, 31]), (None, [31])):
-        found = mediapipe.without_room(poses, clip, clean, furniture)
+        found = mediapipe.without_room(joints, clip, clean, furniture)
         assert (found.confidence[0] == 0).nonzero()[:, 0].tolist() == gone
     shown = Clean(torch.from_numpy(frame).float() / 255, torch.zeros_like(chair))
-    assert torch.equal(
-        mediapipe.without_room(poses, clip, shown, chair).confidence, poses.confidence
-    )
+    found = mediapipe.without_room(joints, clip, shown, chair)
+    assert torch.equal(found.confidence, joints.confidence)
 
 
 def test_nothing_is_found_in_an_empty_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    write_jpeg(crowd(), tmp_path / "000000.jpg")
-    monkeypatch.setattr(mediapipe, "loaded", {"d": detector, "l": landmarks}.__getitem__)
-    clip = Clip(str(tmp_path), W, H, torch.zeros(1), 5.0)
-    found = mediapipe.find_poses(mediapipe.PoseInputs(clip, ("d", "l"), ""))
+    tracks, found = poses_in(clip_of(tmp_path, [crowd()]), monkeypatch)
     assert found.points.shape == (0, 33, 2)
+    assert tracks.masks.counts == ()
     assert mediapipe.detected(crowd(), detector) == []
-    assert np.array_equal(
-        mediapipe.refined(np.full((39, 2), -9.0), np.zeros((64, 64, 39)))[0], [-9, -9]
-    )
+    outside = np.full((39, 2), -9.0)
+    assert np.array_equal(mediapipe.refined(outside, np.zeros((64, 64, 39))), outside)
 
 
 def test_the_layout_names_what_the_body_model_has():
@@ -192,9 +192,8 @@ class TestWeights:
     ):
         content = b"\0\0\0\0TFL3" + bytes(9)
         digest = hashlib.sha256(content).hexdigest()
-        wheel = {name: (here, digest) for name, (here, _) in needs.IN_WHEEL.items()}
-        monkeypatch.setattr(needs, "IN_WHEEL", wheel)
-        source = self.archive(tmp_path / "m.whl", dict.fromkeys(wheel, content))
+        monkeypatch.setattr(needs, "DIGESTS", dict.fromkeys(needs.DIGESTS, digest))
+        source = self.archive(tmp_path / "m.whl", dict.fromkeys(needs.IN_WHEEL, content))
         assert needs.networks() is None
         assert run_command("weights", ["mediapipe", str(source)]) == 0
         assert needs.networks() is not None
@@ -252,7 +251,7 @@ def test_joints_and_masks_are_those_of_mediapipe(name: str):
     stored = np.load(CLIPS / name / "mediapipe_full.npz")
     wanted, misses, overlaps = stored["frame"].tolist(), list[float](), list[float]()
     nets = [mediapipe.loaded(str(path)) for path in needs.networks() or ()]
-    for index, _, pixels in read_frames(CLIPS / name / "video.mp4", FramesConfig()):
+    for index, _, pixels in read_frames(CLIPS / name / "video.mp4"):
         if index not in wanted:
             continue
         row, picture = wanted.index(index), pixels()

@@ -6,16 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from filmed import write_film
+from filmed import clip_of, take, write_film
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from mover.core.errors import InputError
 from mover.io.files.cameras import GUESSED
 from mover.perceive.capture import exif_focal, lens_of
-from mover.perceive.config import FramesConfig, Lens
+from mover.perceive.config import FramesConfig
 from mover.perceive.reference import LEAST, median
 from mover.perceive.steady import Drift, align, find_drift, moved, steady_frames, warnings_of, warp
-from mover.perceive.video import Clip, TakeInputs, read_picture, stamp_of, take_frames, write_jpeg
+from mover.perceive.video import Clip, read_picture, stamp_of
 
 BEDROOM = Path(__file__).parents[2] / "shared" / "data" / "sam2_bedroom" / "bedroom.mp4"
 W, H = 320, 180
@@ -35,14 +36,9 @@ def texture(seed: int = 0, size: tuple[int, int] = (260, 420)) -> torch.Tensor:
 
 
 def turn(pan: float, tilt: float, roll: float, zoom: float, f: float) -> np.ndarray:
-    """The homography of a camera that turns about its centre, written out."""
+    """The homography of a camera that turns about its centre."""
     K = np.array([[f, 0, W / 2], [0, f, H / 2], [0, 0, 1]])
-    cy, sy, cx, sx, cz, sz = (g(a) for a in (pan, tilt, roll) for g in (math.cos, math.sin))
-    R = (
-        np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
-        @ np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
-        @ np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
-    )
+    R = Rotation.from_euler("YXZ", (pan, tilt, roll)).as_matrix()
     M = K @ np.diag([zoom, zoom, 1]) @ R @ np.linalg.inv(K)
     return M / M[2, 2]
 
@@ -85,15 +81,11 @@ def test_people_and_light_do_not_pull_the_camera():
 
 
 def write_clip(folder: Path, turns: list[np.ndarray], walkers: bool = False) -> Clip:
-    folder.mkdir()
     world, other = texture(3), texture(4)
-    for k, M in enumerate(turns):
-        picture = view(world, M)
-        if walkers:
-            picture[40:160, 20 + 20 * k : 70 + 20 * k] = other[:120, :50]
-        pixels = (picture * 255).round().to(torch.uint8).numpy()
-        write_jpeg(np.ascontiguousarray(pixels), folder / f"{k:06d}.jpg")
-    return Clip(str(folder), W, H, torch.arange(len(turns)) / 5, 5.0)
+    pictures = [view(world, M) for M in turns]
+    for k, picture in enumerate(pictures if walkers else ()):
+        picture[40:160, 20 + 20 * k : 70 + 20 * k] = other[:120, :50]
+    return clip_of(folder, [(p * 255).round().to(torch.uint8).numpy() for p in pictures])
 
 
 def load_frame(path: Path) -> torch.Tensor:
@@ -136,22 +128,18 @@ def test_a_swaying_camera_is_turned_back(tmp_path: Path):
     assert (a - b).abs().mean() < 0.2 * raw
 
 
-def take(source: Path, out: Path, config: FramesConfig | None = None) -> Clip:
-    return take_frames(TakeInputs(source, stamp_of(source), out), config or FramesConfig())
-
-
 def test_frames_are_chosen_by_the_clock_not_by_counting(tmp_path: Path):
     colours = [10 * k for k in range(20)]
     times = [*range(10), *range(20, 30)]  # a third of a second is missing
     greys = [np.full((48, 64, 3), colour, dtype=np.uint8) for colour in colours]
-    write_film(tmp_path / "v.mp4", greys, times)
-    clip = take(tmp_path / "v.mp4", tmp_path / "f", FramesConfig(fps=10))
+    film = write_film(tmp_path / "v.mp4", greys, times)
+    clip = take(film, tmp_path / "f", FramesConfig(fps=10))
     assert clip.time.mul(30).round().tolist() == [0, 3, 6, 9, 21, 24, 27, 29]
     assert clip.numbers.tolist() == [0, 1, 2, 3, 7, 8, 9, 10]  # a tenth of a second each
     greys = [float(load_frame(clip.path(k)).mean()) * 255 for k in range(len(clip.time))]
     expected = [colours[times.index(round(30 * t))] for t in clip.time.tolist()]
     assert greys == pytest.approx(expected, abs=4)
-    part = take(tmp_path / "v.mp4", tmp_path / "g", FramesConfig(fps=10, start=0.2, end=0.31))
+    part = take(film, tmp_path / "g", FramesConfig(fps=10, start=0.2, end=0.31))
     assert part.time.mul(30).round().tolist() == part.index.tolist() == [6, 9]
 
 
@@ -208,11 +196,11 @@ def test_people_whom_a_detector_misses_are_not_in_the_clean_picture(missed: tupl
 
 def test_the_lens_comes_from_the_file_the_angle_or_the_photo(tmp_path: Path):
     (tmp_path / "geo.json").write_text('{"f": 700, "pitch": -0.2, "roll": 0.05}')
-    at, text = lens_of((640, 480), Lens(tmp_path / "geo.json"))
+    at, text = lens_of((640, 480), tmp_path / "geo.json")
     assert (at.value["fl_x"], text) == (700, None)
     up = np.array(at.value["R_cam_world"])[:, 1]
     assert math.asin(up[2]) == pytest.approx(-0.2)
-    at, _ = lens_of((640, 480), Lens(fov=90.0))
+    at, _ = lens_of((640, 480), fov=90.0)
     assert at.value["fl_x"] == pytest.approx(320)
     assert at.value["focal_spread"] == GUESSED
     picture = Image.new("RGB", (36, 24))
@@ -220,9 +208,9 @@ def test_the_lens_comes_from_the_file_the_angle_or_the_photo(tmp_path: Path):
     exif.get_ifd(0x8769)[0xA405] = 28
     picture.save(tmp_path / "p.jpg", exif=exif)
     assert exif_focal(tmp_path / "p.jpg", (3600, 2400)) == pytest.approx(2800)
-    at, text = lens_of((3600, 2400), Lens(tmp_path / "p.jpg"))
+    at, text = lens_of((3600, 2400), tmp_path / "p.jpg")
     assert text is None
-    _, text = lens_of((3600, 2400), Lens())
+    _, text = lens_of((3600, 2400))
     assert "--fov" in (text or "")
 
 

@@ -44,6 +44,7 @@ from mover.perceive.layout import (
 )
 from mover.perceive.screen import ScreenInputs, outermost, screen
 from mover.perceive.standing import seen_from, standing_on
+from mover.stages.objects.gather_given import unplaced
 from mover.stages.posterior import Gaussian
 
 W, H, FOCAL = 480, 320, 420.0
@@ -139,7 +140,7 @@ def screen_inputs(pieces: list[SceneObject], height: float | None) -> ScreenInpu
     return ScreenInputs(
         camera(), torch.stack([d.box for d in picture(pieces, camera()).detections]),
         torch.full((4, 4), SEEN), torch.full((4,), torch.nan), torch.arange(4),
-        torch.stack([outermost(v) for v in low]), height,
+        torch.stack([outermost(v) for v in low]), height, unplaced(4),
     )  # fmt: skip
 
 
@@ -169,7 +170,7 @@ def test_a_thing_of_which_many_shapes_are_known_says_no_more_than_another(pieces
     odd = torch.tensor([1.3, 1, 1, 1])[:, None, None]  # one is not of the usual size
     once = replace(once, points=once.points * odd)
     rows = torch.tensor([0] * 8 + [1, 2, 3])
-    often = replace(once, thing=rows, points=once.points[rows])
+    often = replace(once, thing=rows, points=once.points[rows], given=unplaced(len(rows)))
     config = ScreenConfig(tilt=0.0, tilt_known=0.0)
     assert screen(often, config).height == pytest.approx(screen(once, config).height, abs=5e-4)
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from filmed import clip_of
 from tiny_models import tiny_mask2former, tiny_vitpose
 
 from mover.core.errors import InputError
@@ -16,7 +17,6 @@ from mover.geometry.rle import decode, encode
 from mover.perceive.config import ModelsConfig, PerceiveConfig
 from mover.perceive.networks import (
     PERSON,
-    DetectInputs,
     Finds,
     JointsInputs,
     Network,
@@ -26,9 +26,8 @@ from mover.perceive.networks import (
     joints_in,
     link_people,
     network,
-    overlap,
 )
-from mover.perceive.video import Clip, write_jpeg
+from mover.perceive.video import Clip
 
 pytest.importorskip("transformers")
 pytestmark = pytest.mark.filterwarnings("default")  # transformers warns about itself
@@ -48,11 +47,9 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> ModelsConfig:
     )
 
 
-def clip_of(folder: Path, count: int) -> Clip:
+def noisy(folder: Path, count: int) -> Clip:
     rng = np.random.default_rng(0)
-    for k in range(count):
-        write_jpeg(rng.integers(0, 255, (H, W, 3)).astype(np.uint8), folder / f"{k:06d}.jpg")
-    return Clip(str(folder), W, H, torch.arange(count) / 5, 5.0)
+    return clip_of(folder, rng.integers(0, 255, (count, H, W, 3)).astype(np.uint8))
 
 
 def mask(rows: slice, columns: slice) -> torch.Tensor:
@@ -88,7 +85,8 @@ def test_crafted_logits_become_known_masks_and_classes(folders: ModelsConfig):
     assert found.frame.tolist() == [7, 7]
     assert bool((found.score > 0.9).all())
     for index, one in enumerate(truth.values()):
-        assert overlap(decode(found.masks, index)[None], one[None]) > 0.95
+        drawn = decode(found.masks, index)
+        assert (drawn & one).sum() > 0.95 * (drawn | one).sum()
     assert link_people(found).masks.counts == found.masks.counts[1:]
 
 
@@ -101,7 +99,7 @@ def test_crafted_heat_becomes_known_joints(folders: ModelsConfig):
         heat[0, k] = torch.exp(-((x - px).square() + (y - py).square()) / 4)
     said = Network(Says(SimpleNamespace(heatmaps=heat), net.model.config), net.processor, "cpu")
     box = torch.tensor([20.0, 16.0, 65.0, 76.0])  # 45 x 60: the shape of the heat map
-    found = joints_in(said, [np.zeros((H, W, 3), dtype=np.uint8)], [box])[0]
+    (found,) = joints_in(said, [np.zeros((H, W, 3), dtype=np.uint8)], box[None])
     # the box grows by a quarter about its middle; cells lie evenly over it, from edge to edge
     low = (box[:2] + box[2:]) / 2 - 1.25 * (box[2:] - box[:2]) / 2
     step = 1.25 * (box[2:] - box[:2]) / torch.tensor([12.0, 16.0])
@@ -115,14 +113,14 @@ def test_crafted_heat_becomes_known_joints(folders: ModelsConfig):
 
 
 def test_networks_run_on_frames_in_batches(folders: ModelsConfig, tmp_path: Path):
-    clip, config = clip_of(tmp_path, 5), PerceiveConfig(models=folders, score=0.0)
-    found = find_instances(DetectInputs(clip, tuple(range(5))), config)
-    single = find_instances(DetectInputs(clip, (3,)), config)
+    clip, config = noisy(tmp_path, 5), PerceiveConfig(models=folders, score=0.0)
+    found = find_instances(clip, config)
+    single = find_instances(clip.part(3, 4), config)
     rows = (found.frame == 3).nonzero()[:, 0].tolist()
     assert rows
     assert [found.category[k] for k in rows] == list(single.category)
     assert [found.masks.counts[k] for k in rows] == list(single.masks.counts)
-    assert find_instances(DetectInputs(clip, ()), config).category == ()
+    assert find_instances(clip.part(0, 0), config).category == ()
 
 
 def test_people_keep_their_numbers_where_detections_are_linked():
@@ -145,7 +143,7 @@ def test_people_keep_their_numbers_where_detections_are_linked():
 
 
 def test_joints_of_all_people_are_found_row_by_row(folders: ModelsConfig, tmp_path: Path):
-    clip = clip_of(tmp_path, 3)
+    clip = noisy(tmp_path, 3)
     code = encode(mask(slice(20, 80), slice(40, 85)))
     zeros = torch.zeros(20, dtype=torch.long)
     tracks = People(Masks(H, W, (code,) * 20), torch.arange(20) % 3, zeros)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from filmed import clip_of
 from PIL import Image
 from test_lens import FOCAL, camera_of, picture_of
 from tiny_models import tiny_mask2former, tiny_vitpose
@@ -15,12 +16,13 @@ from mover.core.run import Run
 from mover.core.types import Keypoints, Masks, People
 from mover.geometry.rle import decode, encode
 from mover.io.people.keypoints import read_keypoints
-from mover.perceive.capture import Finders, Video, lens_by_lines, perceive, restless
-from mover.perceive.config import FramesConfig, Lens, ModelsConfig, PerceiveConfig
+from mover.perceive.capture import Finders, lens_by_lines, perceive, restless
+from mover.perceive.config import ModelsConfig, PerceiveConfig
 from mover.perceive.networks import Finds
+from mover.perceive.own import Video
 from mover.perceive.reference import Clean, detections_in, grown, hidden_mask, reference_of
 from mover.perceive.steady import Drift
-from mover.perceive.video import Clip, write_jpeg
+from mover.perceive.video import Clip
 
 W, H, FRAMES = 128, 96, 7
 
@@ -31,29 +33,27 @@ def room() -> np.ndarray:
     return np.array(small.resize((W, H), Image.Resampling.BICUBIC))
 
 
-def clip_of(folder: Path) -> Clip:
+def walked(folder: Path) -> Clip:
     """A grey person walks through a room."""
-    folder.mkdir()
-    for k in range(FRAMES):
-        picture = room()
+    pictures = [room() for _ in range(FRAMES)]
+    for k, picture in enumerate(pictures):
         picture[20:90, 10 + 12 * k : 30 + 12 * k] = 90
-        write_jpeg(picture, folder / f"{k:06d}.jpg")
-    return Clip(str(folder), W, H, torch.arange(FRAMES) / 5, 5.0)
+    return clip_of(folder, pictures)
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("default")  # transformers warns about itself
 def test_a_folder_of_pictures_becomes_a_capture_and_is_not_read_twice(tmp_path: Path):
     pytest.importorskip("transformers")
-    clip_of(tmp_path / "in")
+    walked(tmp_path / "in")
     out, said = tmp_path / "c", list[str]()
     masks, joints = tiny_mask2former(tmp_path / "masks"), tiny_vitpose(tmp_path / "joints")
     models = ModelsConfig(str(masks), str(joints))
-    config = PerceiveConfig(FramesConfig(folder_fps=5.0), models, score=0.0)
+    config = PerceiveConfig(models=models, score=0.0)
 
     def go() -> None:
         run = Run(out / "perceived")
-        perceive(Video(tmp_path / "in", Lens(fov=65.0)), out, config, run, said.append, Finders())
+        perceive(Video(tmp_path / "in", fov=65.0), out, config, run, said.append, Finders())
 
     go()
     assert "% of the room are never seen" in said[-1]
@@ -79,7 +79,7 @@ def test_the_reference_is_the_room_without_the_walker(tmp_path: Path):
     zeros = torch.zeros(FRAMES, dtype=torch.long)
     tracks = People(Masks(H, W, codes), torch.arange(FRAMES), zeros)
     still = Drift(torch.eye(3).expand(FRAMES, 3, 3), torch.ones(FRAMES), 0, 0.0, "still")
-    clean = reference_of(clip_of(tmp_path / "f"), still, tracks)
+    clean = reference_of(walked(tmp_path / "f"), still, tracks)
     assert not clean.hidden.any()
     assert hidden_mask(clean) is None
     assert (clean.picture - torch.from_numpy(room()) / 255).abs().mean() < 0.03

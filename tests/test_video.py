@@ -10,30 +10,25 @@ import pytest
 import torch
 
 from mover.app import chain
-from mover.app.chain import BodiesFrom, digest, import_bodies, make_bodies, steps_in
+from mover.app.chain import check_bodies, digest, import_bodies, steps_in
 from mover.app.cli import run_command
 from mover.app.cli.video import VideoArgs, video_to_room
 from mover.core.errors import InputError
 from mover.io.capture.bodies_file import read_bodies, write_bodies
+from mover.io.files.fields import write_json
 from mover.perceive import needs
 from mover.perceive.config import ModelsConfig
 from mover.perceive.needs import FACTS, missing
-from mover.perceive.steady import Drift, first_cut, warnings_of
+from mover.perceive.steady import first_cut
 
 NAMES = ("first", "second")
-
-
-def said() -> tuple[list[str], chain.Say]:
-    lines: list[str] = []
-    return lines, lines.append
 
 
 class TestSteps:
     def do(self, folder: Path, word: str, yours: bool = False) -> list[str]:
         """One step in a new process that writes a word, made from in.txt and the word."""
-        lines, say = said()
-        made = folder / "made.txt"
-        steps = steps_in(folder, say, NAMES)
+        lines, made = list[str](), folder / "made.txt"
+        steps = steps_in(folder, lines.append, NAMES)
         steps.do("first", [folder / "in.txt", word], made, lambda: made.write_text(word) and None,
                  yours=yours)  # fmt: skip
         return lines
@@ -63,7 +58,7 @@ class TestSteps:
         for text in (None, "user's"):
             self.do(tmp_path, "one")
             made.write_text(text or made.read_text())
-            steps_in(tmp_path, said()[1], NAMES).undo("first", made)
+            steps_in(tmp_path, print, NAMES).undo("first", made)
             assert made.exists() == (text is not None)
 
     def test_a_step_that_dies_is_not_taken_for_finished(self, tmp_path: Path):
@@ -72,14 +67,14 @@ class TestSteps:
             raise InputError("no")
 
         with pytest.raises(InputError):
-            steps_in(tmp_path, said()[1], NAMES).do("first", [], tmp_path / "made.txt", dies)
+            steps_in(tmp_path, print, NAMES).do("first", [], tmp_path / "made.txt", dies)
         assert len(self.do(tmp_path, "one")) == 2
 
     @pytest.mark.parametrize("text", ["", "{", "[]", '{"steps": 3}', '{"steps": {"first": 5}}'])
     def test_a_damaged_log_is_said_and_dropped(self, tmp_path: Path, text: str):
         (tmp_path / "steps.json").write_text(text)
-        lines, say = said()
-        assert steps_in(tmp_path, say, NAMES).log == {}
+        lines = list[str]()
+        assert steps_in(tmp_path, lines.append, NAMES).log == {}
         assert "steps.json is damaged" in lines[0]
 
     def test_files_count_by_their_content_and_words_are_no_files(self, tmp_path: Path):
@@ -97,18 +92,18 @@ class TestBodies:
     )
     def test_what_cannot_work_is_said_before(self, source: str, tool: str, words: str):
         with pytest.raises(InputError, match=words):
-            BodiesFrom(source, tool).check()
+            check_bodies(source, tool)
 
     def make(self, capture: Path, code: str) -> None:
         command = f"{sys.executable} -c {json.dumps(code)} {{video}} {{frames}} {{camera}} {{out}}"
-        make_bodies(BodiesFrom(command), capture / "video.mp4", capture, lambda: None)
+        import_bodies(command, "", capture / "video.mp4", capture)
 
     def test_a_command_that_fails_is_one_sentence(self, tmp_path: Path):
         for code, words in (("exit(3)", "ended with code 3"), ("pass", "wrote nothing to")):
             with pytest.raises(InputError, match=words):
                 self.make(tmp_path, code)
         with pytest.raises(InputError, match=r"--bodies: no-such-program: No such file"):
-            make_bodies(BodiesFrom("no-such-program {out}"), tmp_path, tmp_path, lambda: None)
+            import_bodies("no-such-program {out}", "", tmp_path, tmp_path)
 
     def test_a_command_gets_the_video_the_frames_and_the_lens_and_its_bodies_are_read(
         self, tmp_path: Path, small_room
@@ -126,7 +121,7 @@ class TestBodies:
     def test_a_file_that_holds_no_bodies_is_refused_and_nothing_is_written(self, tmp_path: Path):
         np.savez(tmp_path / "other.npz", a=np.zeros(3))
         with pytest.raises(InputError, match=r"other\.npz"):
-            import_bodies(tmp_path / "other.npz", "", tmp_path)
+            import_bodies(str(tmp_path / "other.npz"), "", tmp_path, tmp_path)
         assert not (tmp_path / "bodies.npz").exists()
 
 
@@ -167,24 +162,14 @@ class TestNetworks:
         assert not [s for s in missing(models) if "holds no network" in s]
 
 
-class TestCuts:
-    def test_a_picture_that_changes_at_once_and_for_good_is_a_cut(self):
-        agree = [1.0, 0.95, 0.9, *[0.05] * 7]
-        assert first_cut(agree) == 3
-        eye = torch.eye(3).expand(7, 3, 3)
-        drift = Drift(eye, torch.ones(7), 0, 0.0, "still", 3, (3,))
-        (text,) = warnings_of(drift, torch.arange(10) / 5)
-        assert "cut at 0.6 s" in text
-        assert "--frames.end 0.6" in text
-        assert "the longest is used, 0.6 to 1.8 s" in text
-
-    @pytest.mark.parametrize("agree", [
-        [1.0, 0.9, 0.1, 0.1, 0.9, 0.9, 0.9, 0.9],  # a person passes close by
-        [1.0, 0.8, 0.6, 0.45, 0.3, 0.2, 0.1, 0.1],  # the camera walks away
-        [1.0] * 8,
-    ])  # fmt: skip
-    def test_a_person_who_passes_by_and_a_camera_that_walks_are_none(self, agree: list[float]):
-        assert first_cut(agree) is None
+@pytest.mark.parametrize(("agree", "cut"), [
+    ([1.0, 0.95, 0.9, *[0.05] * 7], 3),
+    ([1.0, 0.9, 0.1, 0.1, 0.9, 0.9, 0.9, 0.9], None),  # a person passes close by
+    ([1.0, 0.8, 0.6, 0.45, 0.3, 0.2, 0.1, 0.1], None),  # the camera walks away
+    ([1.0] * 8, None),
+])  # fmt: skip
+def test_a_picture_that_changes_at_once_and_for_good_is_a_cut(agree: list[float], cut: int | None):
+    assert first_cut(agree) == cut
 
 
 def test_heights_are_told_to_the_room_by_track(tmp_path: Path):
@@ -218,9 +203,7 @@ def test_a_video_becomes_a_room_and_files_that_are_replaced_stay(tmp_path, small
     finders = Seen(small_room, add_noise(small_room, NoiseConfig(), 1), 1).finders()
     K, camera = small_room.truth.camera.K, small_room.truth.camera
     lens = {"w": camera.width, "h": camera.height, "fl_x": float(K[0, 0]), "fl_y": float(K[1, 1])}
-    (tmp_path / "lens.json").write_text(
-        json.dumps({**lens, "cx": float(K[0, 2]), "cy": float(K[1, 2])})
-    )
+    write_json({**lens, "cx": float(K[0, 2]), "cy": float(K[1, 2])}, tmp_path / "lens.json")
     args = VideoArgs(video, out, camera=tmp_path / "lens.json")
     video_to_room(args, finders)
     assert (out / "room" / "report.html").is_file()
@@ -231,7 +214,6 @@ def test_a_video_becomes_a_room_and_files_that_are_replaced_stay(tmp_path, small
     assert (found.verts.norm(dim=-1).mean() / heights - 1).abs() < 0.15
     capsys.readouterr()
     write_bodies(bodies, out / "capture" / "bodies.npz")
-    args = VideoArgs(video, out, camera=args.camera)
     video_to_room(args, finders)
     told = capsys.readouterr().out
     assert [line for line in told.splitlines() if line.endswith("kept")] == [

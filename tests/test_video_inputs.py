@@ -19,6 +19,7 @@ from filmed import (
     W,
     filmed,
     instances,
+    take,
     turned_film,
     walk,
     write_film,
@@ -29,18 +30,18 @@ from mover.app.cli.video import VideoArgs, video_to_room
 from mover.core.errors import InputError
 from mover.core.observe import Observer, silent
 from mover.core.run import Run
-from mover.core.types import Masks, Scene
+from mover.core.types import Keypoints, Masks, People, Scene
 from mover.geometry.rle import decode, tight_box
 from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.scene_file import read_scene
 from mover.io.people.keypoints import read_keypoints
 from mover.perceive import mediapipe
-from mover.perceive.capture import Finders, Video, perceive, read_picture_of
-from mover.perceive.config import FramesConfig, Lens, PerceiveConfig
-from mover.perceive.mediapipe import PoseInputs, Poses
-from mover.perceive.networks import DetectInputs, Finds, link_people
-from mover.perceive.own import Own
-from mover.perceive.video import TakeInputs, stamp_of, take_frames
+from mover.perceive.capture import Finders, perceive, read_picture_of
+from mover.perceive.config import FramesConfig, PerceiveConfig
+from mover.perceive.mediapipe import PoseInputs
+from mover.perceive.networks import Finds, link_people
+from mover.perceive.own import Video
+from mover.perceive.video import Clip
 
 pytest.importorskip("cv2")
 SECOND = 30
@@ -48,7 +49,7 @@ SECOND = 30
 
 def perceived(source: Path, out: Path, fps: float = 5.0, lens: Path | None = None) -> Path:
     config = PerceiveConfig(FramesConfig(fps=fps))
-    video = Video(source, Lens(lens, 60.0 if lens is None else None))
+    video = Video(source, lens, 60.0 if lens is None else None)
     perceive(video, out, config, Run(out / "perceived"), print, FINDERS)
     return out
 
@@ -96,21 +97,18 @@ def test_what_moves_evenly_moves_evenly_in_an_uneven_video(tmp_path: Path):
 @pytest.mark.parametrize(("gap", "fps"), [(15, 5.0), (15, 0.0), (1, 0.0)])
 def test_of_a_slow_video_or_at_its_own_rate_all_frames_are_taken_at_their_times(tmp_path, gap, fps):
     times = [*range(0, 20 * gap, gap), *range(60 * gap, 70 * gap, gap)]  # a pause between
-    filmed(tmp_path / "v.mp4", Shot(), times)
-    config = FramesConfig(fps=fps)
-    source = tmp_path / "v.mp4"
-    clip = take_frames(TakeInputs(source, stamp_of(source), tmp_path / "f"), config)
+    film = filmed(tmp_path / "v.mp4", Shot(), times)
+    clip = take(film, tmp_path / "f", FramesConfig(fps=fps))
     assert clip.fps == pytest.approx(SECOND / gap)
     assert clip.numbers.tolist() == [*range(20), *range(60, 70)]
     assert clip.time.tolist() == pytest.approx([t / SECOND for t in times], abs=1e-3)
 
 
 def test_another_video_in_the_same_folder_leaves_nothing_of_the_first(tmp_path: Path):
-    filmed(tmp_path / "v.mp4", Shot(), range(0, 2 * SECOND, 3))
-    perceived(tmp_path / "v.mp4", tmp_path / "c")
+    perceived(filmed(tmp_path / "v.mp4", Shot(), range(0, 2 * SECOND, 3)), tmp_path / "c")
     assert (tmp_path / "c" / "keypoints.npz").is_file()
-    filmed(tmp_path / "w.mp4", Shot(person=False), range(0, SECOND, 3))
-    perceived(tmp_path / "w.mp4", tmp_path / "c")
+    empty = filmed(tmp_path / "w.mp4", Shot(person=False), range(0, SECOND, 3))
+    perceived(empty, tmp_path / "c")
     assert len(list((tmp_path / "c" / "frames").iterdir())) == 5
     assert not (tmp_path / "c" / "keypoints.npz").exists()
 
@@ -119,17 +117,11 @@ SWAY = [(0, 0), (3, 1), (5, 2), (4, 1), (2, 0), (0, 0)]
 """Where in the world the pictures of a swaying camera begin [px]."""
 
 
-def swaying(path: Path) -> Path:
-    """A film of a swaying camera, five pictures a second of which every second one repeats."""
-    shots = [Shot(look=(4 + x, 4 + y)) for x, y in SWAY for _ in range(2)]
-    pictures = [shot.at(0.2 * (k // 2)) for k, shot in enumerate(shots)]
-    write_film(path, pictures, [3 * k for k in range(len(pictures))])
-    return path
-
-
 def test_joints_masks_and_outlines_in_pixels_of_a_swaying_video_are_carried_along(tmp_path: Path):
     """Each file counts the frames of the video; the people's numbers are those of the masks."""
-    film = swaying(tmp_path / "v.mp4")
+    shots = [Shot(look=(4 + x, 4 + y)) for x, y in SWAY for _ in range(2)]  # each is there twice
+    pictures = [shot.at(0.2 * (k // 2)) for k, shot in enumerate(shots)]
+    film = write_film(tmp_path / "v.mp4", pictures, range(0, 3 * len(pictures), 3))
     boxes = [(round(walk(0.2 * k)), H - 70, 20, 62) for k in range(len(SWAY))]  # x, y, w, h
     joints, images, people = [], [], []
     for k, (x, y, w, h) in enumerate(boxes):
@@ -146,12 +138,11 @@ def test_joints_masks_and_outlines_in_pixels_of_a_swaying_video_are_carried_alon
     labelme = {"imageWidth": W, "imageHeight": H, "shapes": [shape]}
     for name, tree in (("joints", joints), ("masks", masks), ("chair", labelme)):
         (tmp_path / f"{name}.json").write_text(json.dumps(tree))
-    own = Own(
-        lambda: tmp_path / "joints.json", masks=tmp_path / "masks.json",
+    out, said = tmp_path / "c", list[str]()
+    video = Video(
+        film, fov=60.0, keypoints=lambda: tmp_path / "joints.json", masks=tmp_path / "masks.json",
         objects=tmp_path / "chair.json", objects_frame=4,
     )  # fmt: skip
-    out, said = tmp_path / "c", list[str]()
-    video = Video(film, Lens(fov=60.0), own)
     perceive(video, out, PerceiveConfig(), Run(out / "perceived"), said.append, NO_FINDERS)
     (reference,) = re.findall(r"sways .* onto frame (\d+)", "\n".join(said))
     at = SWAY[int(reference)]
@@ -183,16 +174,15 @@ def test_without_a_network_for_furniture_all_else_is_written_and_the_outlines_ar
 
     monkeypatch.setattr(mediapipe, "pose_inputs", lambda clip: PoseInputs(clip, ("", ""), ""))
 
-    def poses(inputs: PoseInputs, _config: None, _observe: Observer = silent) -> Poses:
-        frames = tuple(range(len(inputs.clip.time)))
-        tracks = link_people(instances(DetectInputs(inputs.clip, frames), PerceiveConfig()))
-        count = len(tracks.frame)
-        return Poses(
-            tracks.masks, torch.full((count, 33, 2), 40.0), torch.ones(count, 33), tracks.frame,
-            tracks.person,
-        )  # fmt: skip
+    def poses(
+        inputs: PoseInputs, _config: None, _observe: Observer = silent
+    ) -> tuple[People, Keypoints]:
+        tracks = link_people(instances(inputs.clip, PerceiveConfig()))
+        points = torch.full((len(tracks.frame), 33, 2), 40.0)
+        rows = tracks.frame, tracks.person
+        return tracks, Keypoints(points, torch.ones(points.shape[:2]), "mediapipe33", *rows, None)
 
-    def absent(_inputs: DetectInputs, _config: PerceiveConfig, _: Observer = silent) -> Finds:
+    def absent(_clip: Clip, _config: PerceiveConfig, _: Observer = silent) -> Finds:
         raise InputError("no network")
 
     finders = replace(NO_FINDERS, poses=poses, instances=absent)
@@ -222,11 +212,11 @@ def test_of_a_video_that_is_cut_the_longest_shot_is_used_and_said(tmp_path, caps
     ends = (1.0, 3.4, 5.0)
     times = range(0, 5 * SECOND, 6)
     pictures = [shots[sum(t / SECOND >= end for end in ends)].at(t / SECOND) for t in times]
-    write_film(tmp_path / "v.mp4", pictures, times)
-    capture = perceived(tmp_path / "v.mp4", tmp_path / "c")
+    capture = perceived(write_film(tmp_path / "v.mp4", pictures, times), tmp_path / "c")
     told = capsys.readouterr().out
     assert "the video is cut at 1.0 s, 3.4 s" in told
     assert "the longest is used, 1.0 to 3.2 s" in told
+    assert "--frames.end 1.0 or --frames.start 3.4" in told
     assert "moves" not in told
     frames = [row["image_id"] for row in rows(capture, "people.json")]
     assert frames == list(range(5, 17))
@@ -238,17 +228,16 @@ def test_of_a_video_that_is_cut_the_longest_shot_is_used_and_said(tmp_path, caps
 def test_a_camera_that_moves_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     times = range(0, 3 * SECOND, 6)
     pictures = [Shot(look=(4 * k, 2 * k), chair=False).at(0) for k in range(len(times))]
-    write_film(tmp_path / "v.mp4", pictures, times)
-    perceived(tmp_path / "v.mp4", tmp_path / "c")
+    perceived(write_film(tmp_path / "v.mp4", pictures, times), tmp_path / "c")
     told = capsys.readouterr().out
     assert "warning: the camera moves" in told
     assert "one that stands still" in told
 
 
 def test_a_video_without_furniture_ends_with_one_sentence(tmp_path: Path):
-    filmed(tmp_path / "v.mp4", Shot(chair=False), range(0, SECOND, 3))
+    film = filmed(tmp_path / "v.mp4", Shot(chair=False), range(0, SECOND, 3))
     with pytest.raises(InputError, match=r"finds no furniture in it.*--score 0\.3"):
-        video_to_room(VideoArgs(tmp_path / "v.mp4", tmp_path / "out", fov=60), FINDERS)
+        video_to_room(VideoArgs(film, tmp_path / "out", fov=60), FINDERS)
     assert not (tmp_path / "out" / "room").exists()
 
 
@@ -256,27 +245,19 @@ def test_a_calibration_is_scaled_to_the_frames_and_of_another_format_refused(tmp
     file = tmp_path / "lens.json"
     lens = {"w": 640, "h": 480, "fl_x": 550, "fl_y": 560, "cx": 330, "cy": 235, "height": 1.4}
     file.write_text(json.dumps(lens))
-    filmed(tmp_path / "v.mp4", Shot(), range(0, SECOND, 3))
-    capture = perceived(tmp_path / "v.mp4", tmp_path / "c", lens=file)
+    film = filmed(tmp_path / "v.mp4", Shot(), range(0, SECOND, 3))
+    capture = perceived(film, tmp_path / "c", lens=file)
     found = json.loads((capture / "camera.json").read_text())
     expected = {"w": 128, "h": 96, "fl_x": 110, "fl_y": 112, "cx": 66, "cy": 47, "height": 1.4}
     assert {name: found[name] for name in expected} == pytest.approx(expected)
-    filmed(tmp_path / "tall.mp4", Shot(tall=True), range(0, SECOND, 3))
+    film = filmed(tmp_path / "tall.mp4", Shot(tall=True), range(0, SECOND, 3))
     with pytest.raises(InputError, match=r"lens\.json: .*640 x 480.*96 x 128"):
-        perceived(tmp_path / "tall.mp4", tmp_path / "d", lens=file)
+        perceived(film, tmp_path / "d", lens=file)
 
 
 def test_frames_without_time_stamps_are_counted(tmp_path: Path):
-    av = pytest.importorskip("av")
-    with av.open(str(tmp_path / "v.h264"), "w", format="h264") as container:
-        stream = container.add_stream("libx264", rate=25)
-        stream.width, stream.height, stream.pix_fmt = 128, 96, "yuv420p"
-        for k in range(25):
-            picture = np.ascontiguousarray(Shot().at(k / 25))
-            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-    capture = perceived(tmp_path / "v.h264", tmp_path / "c")
+    film = filmed(tmp_path / "v.h264", Shot(), range(25), rate=25)  # a bare stream
+    capture = perceived(film, tmp_path / "c")
     found = read_keypoints(capture / "keypoints.npz")
     assert found.frame.tolist() == list(range(6))
     true = torch.tensor([walk(min(k / 5, 0.96)) for k in range(6)])
@@ -292,9 +273,8 @@ def room_of(args: VideoArgs, finders: Finders = FINDERS) -> Scene:
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 def test_without_people_the_picture_alone_places_the_furniture_and_that_is_said(tmp_path, capsys):
-    filmed(tmp_path / "v.mp4", Shot(person=False), range(0, SECOND, 3))
-    out = tmp_path / "out"
-    scene = room_of(VideoArgs(tmp_path / "v.mp4", out, fov=60.0))
+    film, out = filmed(tmp_path / "v.mp4", Shot(person=False), range(0, SECOND, 3)), tmp_path / "o"
+    scene = room_of(VideoArgs(film, out, fov=60.0))
     told = capsys.readouterr().out
     assert "no person is seen in the video: only the image places the furniture" in told
     assert [piece.id for piece in scene.objects] == ["chair_0"]
@@ -305,9 +285,8 @@ def test_without_people_the_picture_alone_places_the_furniture_and_that_is_said(
 @pytest.mark.usefixtures("quick")
 def test_ten_minutes_become_a_room(tmp_path: Path):
     times = range(0, 600 * SECOND, 3 * SECOND)  # the picture changes every three seconds
-    filmed(tmp_path / "v.mp4", Shot(), times)
-    out = tmp_path / "out"
-    scene = room_of(VideoArgs(tmp_path / "v.mp4", out, fov=60.0))
+    film, out = filmed(tmp_path / "v.mp4", Shot(), times), tmp_path / "out"
+    scene = room_of(VideoArgs(film, out, fov=60.0))
     assert [piece.id for piece in scene.objects] == ["chair_0"]
     found = read_keypoints(out / "capture" / "keypoints.npz")
     assert (found.frame / found.fps).tolist() == pytest.approx(

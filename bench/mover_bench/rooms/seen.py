@@ -24,7 +24,7 @@ from mover.geometry.camera import at_pixels, project
 from mover.geometry.rle import decode
 from mover.perceive.capture import Finders
 from mover.perceive.config import ModelsConfig, PerceiveConfig
-from mover.perceive.networks import PERSON, DetectInputs, Finds, JointsInputs
+from mover.perceive.networks import PERSON, Finds, JointsInputs
 from mover.perceive.video import Clip
 from mover_bench.rooms.known import KnownRoom
 from mover_bench.rooms.noise import slow
@@ -62,11 +62,9 @@ class Seen:
         fps = self.room.bodies.fps or 1.0
         return [round(float(t) * fps) for t in clip.time]
 
-    def instances(
-        self, inputs: DetectInputs, _config: PerceiveConfig, _observe: Observer = silent
-    ) -> Finds:
+    def instances(self, clip: Clip, _config: PerceiveConfig, _observe: Observer = silent) -> Finds:
         """Furniture in the clean picture, people in frames."""
-        if inputs.clip.fps is None:
+        if clip.fps is None:
             found = [
                 (d.mask.counts[0], COCO[d.category])
                 for d in self.noisy.detections
@@ -77,9 +75,9 @@ class Seen:
             frame = torch.zeros(len(found), dtype=torch.long)
             names = tuple(name for _, name in found)
             return Finds(masks, frame, names, torch.linspace(0.99, 0.9, len(found)))
-        people, of_room = self.noisy.people, self.frames_of(inputs.clip)
+        people, of_room = self.noisy.people, self.frames_of(clip)
         assert people is not None
-        pairs = [(k, int(r)) for k in inputs.frames for r in (people.frame == of_room[k]).nonzero()]
+        pairs = [(k, int(r)) for k, f in enumerate(of_room) for r in (people.frame == f).nonzero()]
         masks = replace(people.masks, counts=tuple(people.masks.counts[r] for _, r in pairs))
         frame = torch.tensor([k for k, _ in pairs], dtype=torch.long)
         return Finds(masks, frame, (PERSON,) * len(pairs), torch.full((len(pairs),), 0.95))

@@ -102,54 +102,51 @@ def digest(made_from: Iterable[Path | str]) -> str:
     return found.hexdigest()[:16]
 
 
-@dataclass(frozen=True)
-class BodiesFrom:
-    """Where bodies come from."""
+def check_bodies(source: str, tool: str) -> None:
+    """Refuse what cannot work, before any other step.
 
-    source: str = FIT  #: `fit`, a file or folder, or a command with {out} in it
-    tool: str = ""  #: what wrote the file, a name of `mover import-bodies`; empty: bodies.npz
+    `source` is `fit`, a file or folder, or a command with {out} in it; `tool` is what writes it, a
+    name of `mover import-bodies`, or empty for bodies.npz.
 
-    @property
-    def is_command(self) -> bool:
-        """Whether it is a command that makes them."""
-        return OUT in self.source
+    Raises:
+        InputError: If there is no such file or tool.
+    """
+    from mover.io.formats import names
 
-    def check(self) -> None:
-        """Refuse what cannot work, before any other step.
-
-        Raises:
-            InputError: If there is no such file or tool.
-        """
-        from mover.io.formats import names
-
-        if self.tool and self.tool not in names("people"):
-            known = ", ".join(names("people"))
-            raise InputError(f"--bodies-tool: {self.tool!r} is none of {known}")
-        if self.source != FIT and not self.is_command and not Path(self.source).exists():
-            raise InputError(
-                f"--bodies: {self.source!r} is neither `fit`, nor a file or folder that is there, "
-                "nor a command with {out} in it"
-            )
+    if tool and tool not in names("people"):
+        raise InputError(f"--bodies-tool: {tool!r} is none of {', '.join(names('people'))}")
+    if source != FIT and OUT not in source and not Path(source).exists():
+        raise InputError(
+            f"--bodies: {source!r} is neither `fit`, nor a file or folder that is there, "
+            "nor a command with {out} in it"
+        )
 
 
-def make_bodies(bodies: BodiesFrom, video: Path, capture: Path, fit: Callable[[], None]) -> None:
-    """Write CAPTURE/bodies.npz: by `fit`, from a file, or by a command.
+def import_bodies(source: str, tool: str, video: Path, capture: Path) -> None:
+    """Write CAPTURE/bodies.npz from a file, or by a command.
 
     A command has the user's {video}, and {frames} and {camera} of the capture.
 
     Raises:
         InputError: If the command fails, or what was written cannot be read.
     """
-    if bodies.source == FIT:
-        fit()
-        return
-    source = Path(bodies.source)
-    if bodies.is_command:
-        source = capture / "bodies-by-command"
-        source = source if bodies.tool else source.with_suffix(".npz")
-        places = {"video": video, "frames": capture / "frames", "camera": capture / "camera.json"}
-        run_command_line("--bodies", bodies.source, {**places, "out": source})
-    import_bodies(source, bodies.tool, capture)
+    from mover.io.capture.bodies_file import read_bodies, write_bodies
+    from mover.io.capture.camera_file import camera_of
+    from mover.io.files.cameras import read_camera_file
+    from mover.io.people.bodies import bodies_from
+    from mover.io.people.found import Known
+
+    file, lens = Path(source), capture / "camera.json"
+    if OUT in source:
+        file = capture / ("bodies-by-command" if tool else "bodies-by-command.npz")
+        places = {"video": video, "frames": capture / "frames", "camera": lens, "out": file}
+        run_command_line("--bodies", source, places)
+    if tool:
+        known = Known(camera_of(read_camera_file(lens, None)))
+        bodies = bodies_from(tool, file, known).bodies
+    else:
+        bodies = read_bodies(file)
+    write_bodies(bodies, capture / "bodies.npz")
 
 
 def run_command_line(flag: str, command: str, places: dict[str, Path]) -> None:
@@ -172,21 +169,6 @@ def run_command_line(flag: str, command: str, places: dict[str, Path]) -> None:
             f"{flag}: the command wrote nothing to {places['out'].name}, which stands for "
             f"{OUT}: {shlex.join(words)}"
         )
-
-
-def import_bodies(source: Path, tool: str, capture: Path) -> None:
-    """bodies.npz of the capture from bodies.npz elsewhere, or from what a tool wrote."""
-    from mover.io.capture.bodies_file import read_bodies, write_bodies
-    from mover.io.capture.camera_file import camera_of
-    from mover.io.files.cameras import read_camera_file
-    from mover.io.people.bodies import bodies_from
-    from mover.io.people.found import Known
-
-    if not tool:
-        write_bodies(read_bodies(source), capture / "bodies.npz")
-        return
-    camera = camera_of(read_camera_file(capture / "camera.json", None))
-    write_bodies(bodies_from(tool, source, Known(camera)).bodies, capture / "bodies.npz")
 
 
 def write_heights(capture: Path, heights: tuple[float, ...]) -> None:

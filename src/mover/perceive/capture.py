@@ -9,7 +9,7 @@ CAPTURE/reference.png, objects.json, people.json, keypoints.npz, camera.json, sc
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,14 +39,22 @@ from mover.io.files.fields import At, read_json, write_json
 from mover.io.files.images import find_depth_file, opened, read_depth, reference_frame, write_image
 from mover.io.people.keypoints import write_keypoints
 from mover.perceive import mediapipe, networks
-from mover.perceive.config import Lens, ModelsConfig, PerceiveConfig
+from mover.perceive.config import ModelsConfig, PerceiveConfig
 from mover.perceive.layout import FirstScene, Picture
-from mover.perceive.mediapipe import PoseInputs, Poses, find_poses
-from mover.perceive.networks import DetectInputs, Finds, JointsInputs
-from mover.perceive.own import Own, own_keypoints, own_masks, own_objects, same_people
-from mover.perceive.reference import Clean, clip_of_clean, detections_in, hidden_mask, reference_of
+from mover.perceive.mediapipe import PoseInputs, find_poses
+from mover.perceive.networks import Finds, JointsInputs
+from mover.perceive.own import Say, Video, own_keypoints, own_masks, own_objects, same_people
+from mover.perceive.reference import Clean, detections_in, hidden_mask, reference_of
 from mover.perceive.steady import Drift, find_drift, steady_frames, warnings_of
-from mover.perceive.video import PICTURES, Clip, TakeInputs, rate_of, stamp_of, take_frames
+from mover.perceive.video import (
+    PICTURES,
+    Clip,
+    TakeInputs,
+    rate_of,
+    stamp_of,
+    take_frames,
+    write_jpeg,
+)
 from mover.stages.camera.find_lens import LensInputs, find_lens, zoomed
 from mover.stages.camera.room_lines import find_segments
 from mover.stages.config import LensConfig
@@ -68,26 +76,15 @@ TILT = math.radians(8)  # of a camera on a shelf, before anything is seen of it
 CLEARLY = 2.0  # standard deviations by which lines contradict a lens before any body is seen
 USUAL = 60.0  # [degrees], horizontal field of view of phones held level, where nothing is known
 EXIF_IFD, FOCAL_35 = 0x8769, 0xA405
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Finders:
     """Stages that look at pictures: the networks, or what stands for them."""
 
-    instances: Callable[[DetectInputs, PerceiveConfig, Observer], Finds] = networks.find_instances
+    instances: Callable[[Clip, PerceiveConfig, Observer], Finds] = networks.find_instances
     joints: Callable[[JointsInputs, ModelsConfig, Observer], Keypoints] = networks.find_joints
-    poses: Callable[[PoseInputs, None, Observer], Poses] = find_poses
-
-
-@dataclass(frozen=True)
-class Video:
-    """What is looked at."""
-
-    source: Path
-    """A video, a folder of pictures, or one picture."""
-    lens: Lens = field(default_factory=Lens)
-    own: Own = field(default_factory=Own)
+    poses: Callable[[PoseInputs, None, Observer], tuple[People, Keypoints]] = find_poses
 
 
 def perceive(
@@ -99,27 +96,26 @@ def perceive(
         InputError: If the source, a file or a network is missing; if it is only that of furniture,
             all else is written.
     """
-    clip, drift, tracks, joints, poses = moving_people(video, out, config, run, say, finders)
-    at, text = lens_of((clip.width, clip.height), video.lens)
+    clip, drift, tracks, joints = moving_people(video, out, config, run, say, finders)
+    at, text = lens_of((clip.width, clip.height), video.camera, video.fov)
     if text is not None:
         say(f"warning: {text}")
     camera = camera_of(at)
     clean = reference_of(clip, drift, tracks)
     lacking: InputError | None = None
     try:
-        if video.own.objects is not None:
-            objects = own_objects(video.own, clip, drift)
+        if video.objects is not None:
+            objects = own_objects(video, clip, drift)
         else:
             objects = furniture_in(clean, camera, config, run, finders, out)
     except InputError as error:  # all else is written
         objects, lacking = None, error
         (out / "objects.json").unlink(missing_ok=True)  # of another video
-    if poses is not None:
+    if joints is not None and video.mediapipe and video.masks is None:
         outlines = outlined(objects, camera)
-        poses = mediapipe.without_room(poses, clip, clean, outlines)
-        joints = mediapipe.poses_to_keypoints(poses, clip.fps)
+        joints = mediapipe.without_room(joints, clip, clean, outlines)
         if outlines is not None:
-            tracks = replace(tracks, masks=mediapipe.without_furniture(poses, outlines).masks)
+            tracks = mediapipe.without_furniture(tracks, joints, outlines)
             clean = reference_of(clip, drift, tracks)
     unseen = 100 * float(clean.hidden.float().mean())
     count = len(tracks.person.unique())
@@ -154,16 +150,16 @@ def outlined(objects: dict[str, Any] | None, camera: Camera) -> Bool[Tensor, "h 
 
 def moving_people(
     video: Video, out: Path, config: PerceiveConfig, run: Run, say: Say, finders: Finders
-) -> tuple[Clip, Drift, People, Keypoints | None, Poses | None]:
+) -> tuple[Clip, Drift, People, Keypoints | None]:
     """The steadied clip, and the people in it, at as many frames a second as their motion needs."""
     most = min(DENSEST, rate_of(video.source, replace(config.frames, fps=0.0)) or 0.0)
     while True:
         clip, drift = steady_clip(video.source, out, config, run, say)
-        found = people_of_clip(clip, drift, video.own, config, run, say, finders)
-        joints, faster = found[1], min(2 * (clip.fps or 0.0), most)
-        enough = video.own.keypoints is not None or faster <= (clip.fps or 0.0)
+        tracks, joints = people_of_clip(clip, drift, video, config, run, say, finders)
+        faster = min(2 * (clip.fps or 0.0), most)
+        enough = video.keypoints is not None or faster <= (clip.fps or 0.0)
         if joints is None or enough or not restless(joints):
-            return clip, drift, *found
+            return clip, drift, tracks, joints
         say(f"people move fast: {faster:g} frames a second are taken")
         config = replace(config, frames=replace(config.frames, fps=faster))
 
@@ -202,32 +198,31 @@ def steady_clip(
 
 
 def people_of_clip(
-    clip: Clip, drift: Drift, own: Own, config: PerceiveConfig, run: Run, say: Say, finders: Finders
-) -> tuple[People, Keypoints | None, Poses | None]:
-    """People's masks and joints in all frames: those of the user, of MediaPipe, or of networks.
-
-    Returns:
-        Masks, joints, and both as MediaPipe gives them where the masks are its own.
-    """
-    joints = own_keypoints(own, clip, drift, say)
-    poses = None
-    if own.mediapipe:
-        poses = run.stage(finders.poses, mediapipe.pose_inputs(clip), None)
-        joints = mediapipe.poses_to_keypoints(poses, clip.fps)
-    if own.masks is not None:
-        tracks, poses = own_masks(own.masks, clip, drift, say), None
-    elif poses is not None:
-        tracks = People(poses.masks, poses.frame, poses.person)
-    else:
-        count = len(clip.time)
-        chunks = [tuple(range(k, min(k + CHUNK, count))) for k in range(0, count, CHUNK)]
-        found = [run.stage(finders.instances, DetectInputs(clip, c), config) for c in chunks]
-        tracks = networks.link_people(networks.joined_finds(found))
+    clip: Clip,
+    drift: Drift,
+    video: Video,
+    config: PerceiveConfig,
+    run: Run,
+    say: Say,
+    finders: Finders,
+) -> tuple[People, Keypoints | None]:
+    """People's masks and joints in all frames: those of the user, of MediaPipe, or of networks."""
+    joints = own_keypoints(video, clip, drift, say)
+    tracks: People | None = None
+    if video.mediapipe:
+        tracks, joints = run.stage(finders.poses, mediapipe.pose_inputs(clip), None)
+    if video.masks is not None:
+        tracks = own_masks(video.masks, clip, drift, say)
+    elif tracks is None:
+        starts = range(0, len(clip.time), CHUNK)
+        parts = [run.stage(finders.instances, clip.part(k, k + CHUNK), config) for k in starts]
+        whole = [replace(f, frame=f.frame + k) for f, k in zip(parts, starts, strict=True)]
+        tracks = networks.link_people(networks.joined_finds(whole))
     if joints is None and config.models.keypoints and tracks.masks.counts:
         joints = run.stage(finders.joints, JointsInputs(clip, tracks), config.models)
-    if joints is not None and not (own.keypoints is None and own.masks is None):
+    if joints is not None and not (video.keypoints is None and video.masks is None):
         joints = same_people(joints, tracks)
-    return tracks, joints, poses
+    return tracks, joints
 
 
 def furniture_in(
@@ -238,9 +233,12 @@ def furniture_in(
     Raises:
         InputError: If the network is not there.
     """
-    clip = clip_of_clean(clean, out / "perceived" / "reference")
+    picture, mark = clean.picture, fingerprint(clean.picture)  # another picture is another input
+    folder = out / "perceived" / "reference" / mark
+    write_jpeg((picture * 255).round().to(torch.uint8).numpy(), folder / "000000.jpg")
+    clip = Clip(str(folder), picture.shape[1], picture.shape[0], torch.zeros(1), None)
     try:
-        found = run.stage(finders.instances, DetectInputs(clip, (0,)), config)
+        found = run.stage(finders.instances, clip, config)
     except InputError as error:
         raise InputError(
             f"furniture is not known yet: outline it in {out / 'reference.png'} (labelme, COCO, or "
@@ -270,18 +268,20 @@ def lens_by_lines(
     return zoomed(camera, found.zoom), {"focal_spread": found.spread, "focal_by_lines": True}
 
 
-def lens_of(size: tuple[int, int], lens: Lens) -> tuple[At, str | None]:
+def lens_of(
+    size: tuple[int, int], file: Path | None = None, fov: float | None = None
+) -> tuple[At, str | None]:
     """The fields of camera.json, and a warning where the lens is a guess.
 
     Args:
         size: Width and height of the frames [px].
-        lens: A calibration of any known kind (GeoCalib's also gives pitch and roll), a picture
-            whose EXIF gives the focal length, or the horizontal field of view [degrees].
+        file: A calibration of any known kind (GeoCalib's also gives pitch and roll), or a picture
+            whose EXIF gives the focal length.
+        fov: Horizontal field of view [degrees].
 
     Raises:
         InputError: If what is given cannot be used.
     """
-    file, fov = lens.file, lens.fov
     photo = file if file is not None and file.suffix.lower() in PICTURES else None
     if file is not None and photo is None:
         return _in_pixels_of(size, read_camera_file(file, size)), None

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Annotated
 
 from mover.core.settings import Seconds, Share, Weight, float_in, int_in
@@ -15,13 +14,12 @@ class FramesConfig:
     """Which frames are taken."""
 
     fps: Annotated[float, float_in(0, 1e4)] = 5.0
-    """Frames a second at least, more where people move fast; 0: all, at the rate of the video."""
+    """Frames a second at least, more where people move fast; 0: all, at the rate of the video.
+    Of a folder of pictures, whose rate is not known, all are taken."""
     start: Seconds = 0.0
     """Start of the part that is used [s]."""
     end: Seconds = 0.0
     """Its end [s]; 0: the end of the video."""
-    folder_fps: Annotated[float, float_in(0, 1e4)] = 0.0
-    """Frames a second of a folder of pictures; 0: unknown, all are taken."""
 
 
 @dataclass(frozen=True)
@@ -44,15 +42,6 @@ class PerceiveConfig:
     """Which networks do what."""
     score: Share = 0.5
     """Least score of a detection."""
-
-
-@dataclass(frozen=True)
-class Lens:
-    """What is known of the camera."""
-
-    file: Path | None = None
-    """A calibration, or a photo of the same camera."""
-    fov: Annotated[float, float_in(5, 175)] | None = None
 
 
 @dataclass(frozen=True)

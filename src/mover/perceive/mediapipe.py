@@ -21,14 +21,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool
 from numpy.typing import NDArray
 from torch import Tensor
 
 from mover.core.errors import InputError
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
-from mover.core.types import Keypoints, Masks
+from mover.core.types import Keypoints, Masks, People
 from mover.geometry.rle import decode, encode
 from mover.io.people.found import followed
 from mover.perceive.needs import COMMAND, install, networks
@@ -64,18 +64,6 @@ class PoseInputs:
     """and a hash of their content."""
 
 
-@record
-class Poses:
-    """People in frames, row by row."""
-
-    masks: Masks
-    points: Float[Tensor, "rows 33 2"]
-    """Pixels."""
-    confidence: Float[Tensor, "rows 33"]
-    frame: Int[Tensor, " rows"]
-    person: Int[Tensor, " rows"]
-
-
 def pose_inputs(clip: Clip) -> PoseInputs:
     """A clip with the networks of this machine.
 
@@ -89,13 +77,10 @@ def pose_inputs(clip: Clip) -> PoseInputs:
     return PoseInputs(clip, (str(found[0]), str(found[1])), digest)
 
 
-def poses_to_keypoints(poses: Poses, fps: float | None) -> Keypoints:
-    """The joints alone."""
-    return Keypoints(poses.points, poses.confidence, LAYOUT, poses.frame, poses.person, fps)
-
-
-def find_poses(inputs: PoseInputs, _config: None = None, observe: Observer = silent) -> Poses:
-    """People in all frames of a clip.
+def find_poses(
+    inputs: PoseInputs, _config: None = None, observe: Observer = silent
+) -> tuple[People, Keypoints]:
+    """Masks and joints of the people in all frames of a clip, in the same order.
 
     Raises:
         InputError: If the networks cannot be run.
@@ -113,13 +98,11 @@ def find_poses(inputs: PoseInputs, _config: None = None, observe: Observer = sil
     points = np.array([p for p, _ in found]).reshape(-1, 33, 2)
     low, high = points.min(1), points.max(1)
     person = followed(frames, (low + high) / 2, np.linalg.norm(high - low, axis=1))
-    return Poses(
-        Masks(clip.height, clip.width, tuple(codes)),
-        torch.from_numpy(points).float(),
-        torch.from_numpy(np.array([s for _, s in found]).reshape(-1, 33)).float(),
-        torch.tensor(frames, dtype=torch.long),
-        torch.from_numpy(person),
-    )
+    confidence = np.array([s for _, s in found]).reshape(-1, 33)
+    rows = torch.tensor(frames, dtype=torch.long), torch.from_numpy(person)
+    tracks = People(Masks(clip.height, clip.width, tuple(codes)), *rows)
+    points, confidence = (torch.from_numpy(x).float() for x in (points, confidence))
+    return tracks, Keypoints(points, confidence, LAYOUT, *rows, clip.fps)
 
 
 def people_in(
@@ -233,14 +216,15 @@ LIMBS = (
     ((15, 19), 0.05), ((16, 20), 0.05), ((7, 0, 8), 0.085), ((11, 12, 24, 23, 11), 0.055),
 )  # fmt: skip
 """Landmarks along limbs, and how far skin and clothes reach around them [of the height]."""
+LOOSE = 1.25  # factor on that
 BONES = ((11, 23, 0.3), (12, 24, 0.3), (23, 25, 0.245), (24, 26, 0.245), (25, 27, 0.246),
          (26, 28, 0.246))  # fmt: skip
 """Pairs of landmarks, and how far apart they are [of the height] (Drillis & Contini 1966)."""
 
 
 def without_room(
-    poses: Poses, clip: Clip, clean: Clean, furniture: Bool[Tensor, "h w"] | None
-) -> Poses:
+    joints: Keypoints, clip: Clip, clean: Clean, furniture: Bool[Tensor, "h w"] | None
+) -> Keypoints:
     """The landmarks without confidence where their frame shows the room as it is without people.
 
     A network takes the legs of a chair for those of the person in front of them, and is as sure
@@ -250,14 +234,14 @@ def without_room(
     import cv2
 
     known = ~clean.hidden if furniture is None else ~clean.hidden | furniture
-    confidence = poses.confidence.clone()
-    for frame in poses.frame.unique().tolist():
+    confidence = joints.confidence.clone()
+    for frame in joints.frame.unique().tolist():
         picture = torch.from_numpy(read_picture(clip.path(frame))).float() / 255
         off = picture - clean.picture
         off = (off - off.flatten(0, 1).median(0).values).abs()  # the light may change
         same = (off.amax(-1) < NOISE * off.median().clamp_min(1 / 255)) & known
-        for row in (poses.frame == frame).nonzero()[:, 0].tolist():
-            points = poses.points[row]
+        for row in (joints.frame == frame).nonzero()[:, 0].tolist():
+            points = joints.points[row]
             reach = max(2, round(PATCH * float((points.amax(0) - points.amin(0)).amax())))
             share = cv2.blur(same.float().numpy(), (2 * reach + 1, 2 * reach + 1))
             inside = (points >= 0) & (points < torch.tensor([clip.width, clip.height]))
@@ -266,19 +250,16 @@ def without_room(
             empty[empty.clone()] = torch.from_numpy(share)[y, x] > EMPTY
             if 2 * int(empty.sum()) < len(points):
                 confidence[row, empty] = 0
-    return replace(poses, confidence=confidence)
+    return replace(joints, confidence=confidence)
 
 
-def without_furniture(poses: Poses, furniture: Bool[Tensor, "h w"], margin: float = 1.25) -> Poses:
-    """The masks without what they swallow of the furniture: all of it that no limb is near to.
-
-    `margin` is a factor on how far skin and clothes reach.
-    """
+def without_furniture(tracks: People, joints: Keypoints, furniture: Bool[Tensor, "h w"]) -> People:
+    """The masks without what they swallow of the furniture: all of it that no limb is near to."""
     import cv2
 
     kept = list[bytes]()
-    seen = poses.confidence > 0
-    for row, points in enumerate(poses.points.double().numpy()):
+    seen = joints.confidence > 0
+    for row, points in enumerate(joints.points.double().numpy()):
         tall = max(np.linalg.norm(points[a] - points[b]) / share for a, b, share in BONES)
         near = np.zeros(furniture.shape, np.uint8)
         for limb, reach in LIMBS:
@@ -286,14 +267,14 @@ def without_furniture(poses: Poses, furniture: Bool[Tensor, "h w"], margin: floa
             if len(chain) < 2:
                 continue
             line = points[chain].round().astype(np.int32)[None]
-            width = max(1, round(2 * margin * reach * tall))
+            width = max(1, round(2 * LOOSE * reach * tall))
             cv2.polylines(near, line, isClosed=False, color=1, thickness=width)
             if chain[0] == chain[-1]:
                 cv2.fillPoly(near, line, 1)
-        mask = decode(poses.masks, row)
+        mask = decode(tracks.masks, row)
         less = mask & ~(furniture & ~torch.from_numpy(near).bool())
         kept.append(encode(less if bool(less.any()) else mask))
-    return replace(poses, masks=replace(poses.masks, counts=tuple(kept)))
+    return replace(tracks, masks=replace(tracks.masks, counts=tuple(kept)))
 
 
 @lru_cache(maxsize=4)

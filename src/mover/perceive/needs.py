@@ -37,8 +37,6 @@ FACTS = {
     "usyd-community/vitpose-base-simple": ("joints of people", "Apache-2.0", "0.34 GB"),
 }  # fmt: skip
 """What the networks of `ModelsConfig` find, their licence, and the size of their files."""
-NETWORKS = ("masks", "keypoints")
-"""The fields of `ModelsConfig` that name a network."""
 WHEEL = "mediapipe==0.10.21"
 COMMAND = "mover weights mediapipe"
 SYSTEM = (
@@ -49,14 +47,15 @@ SYSTEM = (
 DETECTOR, LANDMARKS = "pose_detection.tflite", "pose_landmark.tflite"
 """The networks in the cache folder."""
 IN_WHEEL = {
-    "mediapipe/modules/pose_detection/pose_detection.tflite": (
-        DETECTOR, "9ba9dd3d42efaaba86b4ff0122b06f29c4122e756b329d89dca1e297fd8f866c",
-    ),
-    "mediapipe/modules/pose_landmark/pose_landmark_full.tflite": (
-        LANDMARKS, "e9a5c5cb17f736fafd4c2ec1da3b3d331d6edbe8a0d32395855aeb2cdfd64b9f",
-    ),
-}  # fmt: skip
-"""Networks of the wheel, their names here, and their SHA-256."""
+    "mediapipe/modules/pose_detection/pose_detection.tflite": DETECTOR,
+    "mediapipe/modules/pose_landmark/pose_landmark_full.tflite": LANDMARKS,
+}
+"""Networks of the wheel, and their names here."""
+DIGESTS = {
+    DETECTOR: "9ba9dd3d42efaaba86b4ff0122b06f29c4122e756b329d89dca1e297fd8f866c",
+    LANDMARKS: "e9a5c5cb17f736fafd4c2ec1da3b3d331d6edbe8a0d32395855aeb2cdfd64b9f",
+}
+"""SHA-256 of those of the wheel."""
 IN_TASK = {"pose_detector.tflite": DETECTOR, "pose_landmarks_detector.tflite": LANDMARKS}
 """Networks of a bundle pose_landmarker_*.task."""
 LARGEST = 1 << 27  # [bytes], of a network
@@ -71,9 +70,12 @@ def install(extra: str) -> str:
 
 
 def missing(
-    models: ModelsConfig, kinds: Sequence[str] = NETWORKS, *, mediapipe: bool = False
+    models: ModelsConfig, kinds: Sequence[str] = ("masks", "keypoints"), *, mediapipe: bool = False
 ) -> list[str]:
-    """A sentence for each thing that a video needs and this machine lacks; empty: all is there."""
+    """A sentence for each thing that a video needs and this machine lacks; empty: all is there.
+
+    `kinds` are fields of `ModelsConfig` that name a network.
+    """
     kinds = [kind for kind in kinds if getattr(models, kind)]
     extra = "perceive" if kinds else "mediapipe"
     packages = ["av", *(["transformers"] if kinds else [])]
@@ -115,19 +117,6 @@ def absent(kind: str, models: ModelsConfig) -> str:
     )
 
 
-def check_needs(
-    models: ModelsConfig, kinds: Sequence[str] = NETWORKS, *, mediapipe: bool = False
-) -> None:
-    """Refuse to begin where something is missing, see `missing`.
-
-    Raises:
-        InputError: With everything that is missing, a line each, and what to do about it.
-    """
-    lacking = missing(models, kinds, mediapipe=mediapipe)
-    if lacking:
-        raise InputError("\n  ".join(["not on this machine:", *lacking]))
-
-
 def folder() -> Path:
     """Where the networks lie: `$XDG_CACHE_HOME/mover/mediapipe`, by default below ~/.cache."""
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
@@ -154,7 +143,6 @@ def fetch(say: Callable[[str], None], source: Path | None = None) -> None:
             say(f"downloading {WHEEL} (36 MB), of which two files of 9 MB are kept")
             source = _downloaded(Path(place))
         found = _contents(source)
-    folder().mkdir(parents=True, exist_ok=True)
     for name, content in found.items():
         with replacing(folder() / name) as part:
             part.write_bytes(content)
@@ -183,18 +171,15 @@ def _contents(source: Path) -> dict[str, bytes]:
         raise InputError(f"{source}: there is no such file, expected .whl, .task or .tflite")
     if source.suffix == ".tflite":
         return {LANDMARKS: _checked(source.read_bytes(), source.name)}
-    names = {name: here for name, (here, _) in IN_WHEEL.items()}
-    if source.suffix != ".whl":
-        names = IN_TASK
-    found: dict[str, bytes] = {}
+    is_wheel, found = source.suffix == ".whl", dict[str, bytes]()
     try:
         with zipfile.ZipFile(source) as archive:
-            for name, here in names.items():
+            for name, here in (IN_WHEEL if is_wheel else IN_TASK).items():
                 if archive.getinfo(name).file_size > LARGEST:
                     raise InputError(f"{source.name}: {name} is too large for a network")
                 found[here] = _checked(archive.read(name), f"{source.name}: {name}")
                 digest = hashlib.sha256(found[here]).hexdigest()
-                if source.suffix == ".whl" and digest != IN_WHEEL[name][1]:
+                if is_wheel and digest != DIGESTS[here]:
                     raise InputError(f"{source.name}: {name} is not that of {WHEEL}: {digest}")
     except (zipfile.BadZipFile, KeyError, OSError, NotImplementedError) as error:
         raise InputError(

@@ -15,14 +15,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from mover.core.errors import InputError
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
 from mover.core.types import Keypoints, Masks, People
-from mover.geometry.rle import decode, encode, joined, tight_box
+from mover.geometry.rle import encode, joined, mask_boxes
 from mover.io.people.found import followed
 from mover.perceive.config import ModelsConfig, PerceiveConfig
 from mover.perceive.needs import absent, install
@@ -71,14 +71,6 @@ def network(kind: str, config: ModelsConfig) -> Network:
 
 
 @record
-class DetectInputs:
-    """Pictures of a clip."""
-
-    clip: Clip
-    frames: tuple[int, ...]
-
-
-@record
 class Finds:
     """Instances in pictures, row by row."""
 
@@ -88,29 +80,25 @@ class Finds:
     score: Float[Tensor, " rows"]
 
 
-def find_instances(
-    inputs: DetectInputs, config: PerceiveConfig, observe: Observer = silent
-) -> Finds:
-    """Instance masks in some frames.
+def find_instances(clip: Clip, config: PerceiveConfig, observe: Observer = silent) -> Finds:
+    """Instance masks in all frames of a clip.
 
     Raises:
         InputError: If the network is not there.
     """
     net = network("masks", config.models)
-    nothing = Masks(inputs.clip.height, inputs.clip.width, ())
+    nothing, count = Masks(clip.height, clip.width, ()), len(clip.time)
     parts = [Finds(nothing, torch.zeros(0, dtype=torch.long), (), torch.zeros(0))]
-    for begin in range(0, len(inputs.frames), PICTURES):
-        frames = inputs.frames[begin : begin + PICTURES]
-        pictures = [read_picture(inputs.clip.path(k)) for k in frames]
+    for begin in range(0, count, PICTURES):
+        frames = range(begin, min(begin + PICTURES, count))
+        pictures = [read_picture(clip.path(k)) for k in frames]
         parts.append(instances(net, pictures, frames, config.score))
-        observe(Step("find_instances", begin + len(frames), len(inputs.frames)))
+        observe(Step("find_instances", frames.stop, count))
     return joined_finds(parts)
 
 
-def instances(
-    net: Network, pictures: Sequence[Any], frames: Sequence[int], score: float, least: float = LEAST
-) -> Finds:
-    """What Mask2Former or MaskFormer sees in pictures of a size; `least` is a share of its area."""
+def instances(net: Network, pictures: Sequence[Any], frames: Sequence[int], score: float) -> Finds:
+    """What Mask2Former or MaskFormer sees in pictures of one size."""
     inputs = net.processor(images=list(pictures), return_tensors="pt").to(net.device)
     with torch.inference_mode():
         outputs = net.model(**inputs)
@@ -124,7 +112,7 @@ def instances(
         maps = one["segmentation"].cpu()
         for index, info in enumerate(one["segments_info"]):
             mask = maps[index] > 0 if maps.dim() == 3 else maps == int(info["id"])  # a map of ids
-            if int(mask.sum()) < max(1, least * mask.numel()):
+            if int(mask.sum()) < max(1, LEAST * mask.numel()):
                 continue
             codes.append(encode(mask))
             name = str(net.model.config.id2label[int(info["label_id"])]).lower()
@@ -147,26 +135,12 @@ def joined_finds(parts: Sequence[Finds]) -> Finds:
     )
 
 
-def stack_of(masks: Masks) -> Bool[Tensor, "rows h w"]:
-    """Masks as pixels."""
-    if not masks.counts:
-        return torch.zeros(0, masks.height, masks.width, dtype=torch.bool)
-    return torch.stack([decode(masks, k) for k in range(len(masks.counts))])
-
-
-def overlap(a: Bool[Tensor, "n h w"], b: Bool[Tensor, "m h w"]) -> Float[Tensor, "n m"]:
-    """Shared area over joint area of masks."""
-    flat = [x.flatten(1).float() for x in (a, b)]
-    shared = flat[0] @ flat[1].mT
-    return shared / (flat[0].sum(1)[:, None] + flat[1].sum(1)[None] - shared).clamp_min(1)
-
-
 def link_people(found: Finds) -> People:
     """People of all frames, linked by where each was last seen."""
     kept = [k for k, name in enumerate(found.category) if name == PERSON]
     people = replace(found.masks, counts=tuple(found.masks.counts[k] for k in kept))
-    boxes = np.array([tight_box(decode(people, k)).tolist() for k in range(len(kept))])
-    low, high = boxes.reshape(-1, 2, 2).swapaxes(0, 1)
+    low, high = mask_boxes(people).double().reshape(-1, 2, 2).unbind(1)
+    low, high = low.numpy(), high.numpy()
     frames, size = found.frame[kept], np.linalg.norm(high - low, axis=1)
     person = followed(frames.tolist(), (low + high) / 2, size)
     return People(people, frames, torch.from_numpy(person))
@@ -189,14 +163,13 @@ def find_joints(
         InputError: If the network is not there.
     """
     net = network("keypoints", config)
-    tracks = inputs.tracks
+    tracks, boxes = inputs.tracks, mask_boxes(inputs.tracks.masks)
     parts = [torch.zeros(0, 17, 3)]
-    for begin in range(0, len(tracks.frame), PEOPLE):
-        rows = range(begin, min(begin + PEOPLE, len(tracks.frame)))
-        boxes = [tight_box(decode(tracks.masks, row)) for row in rows]
-        pictures = [read_picture(inputs.clip.path(int(tracks.frame[row]))) for row in rows]
-        parts.append(torch.stack(joints_in(net, pictures, boxes)))
-        observe(Step("find_joints", rows[-1] + 1, len(tracks.frame)))
+    for begin in range(0, len(boxes), PEOPLE):
+        frames = tracks.frame[begin : begin + PEOPLE].tolist()
+        pictures = [read_picture(inputs.clip.path(k)) for k in frames]
+        parts.append(joints_in(net, pictures, boxes[begin : begin + PEOPLE]))
+        observe(Step("find_joints", begin + len(frames), len(boxes)))
     found = torch.cat(parts)
     return Keypoints(
         found[..., :2], found[..., 2].clamp(0, 1), "coco17", tracks.frame, tracks.person,
@@ -205,17 +178,13 @@ def find_joints(
 
 
 def joints_in(
-    net: Network, pictures: list[Any], boxes: list[Float[Tensor, "4"]]
-) -> list[Float[Tensor, "joints 3"]]:
+    net: Network, pictures: list[Any], boxes: Float[Tensor, "people 4"]
+) -> Float[Tensor, "people joints 3"]:
     """x, y [px] and confidence of one person's joints in each picture."""
-    corners = [
-        [[x, y, right - x, bottom - y]] for x, y, right, bottom in (b.tolist() for b in boxes)
-    ]
+    corners = [[[x, y, right - x, bottom - y]] for x, y, right, bottom in boxes.tolist()]
     inputs = net.processor(images=pictures, boxes=corners, return_tensors="pt").to(net.device)
     with torch.inference_mode():
         outputs = net.model(**inputs)
     found = net.processor.post_process_pose_estimation(outputs, boxes=corners)
-    return [
-        torch.cat([one[0]["keypoints"], one[0]["scores"].reshape(-1, 1)], -1).float().cpu()
-        for one in found
-    ]
+    each = [torch.cat([one[0]["keypoints"], one[0]["scores"].reshape(-1, 1)], -1) for one in found]
+    return torch.stack(each).float().cpu()

@@ -25,13 +25,20 @@ from mover.io.people.keypoints import keypoints_from, read_keypoints
 from mover.perceive.steady import Drift, moved, warp
 from mover.perceive.video import Clip
 
+Say = Callable[[str], None]
 FEW = 0.5  # share of the frames: with fewer in a file the user is warned
 
 
 @dataclass(frozen=True)
-class Own:
-    """What is handed in, or MediaPipe's, in place of what the networks of transformers find."""
+class Video:
+    """What is looked at, and what stands in place of what the networks of transformers find."""
 
+    source: Path
+    """A video, a folder of pictures, or one picture."""
+    camera: Path | None = None
+    """A calibration, or a photo of the same camera."""
+    fov: float | None = None
+    """Horizontal field of view [degrees]."""
     keypoints: Callable[[], Path] | None = None
     """Gives the file of people's joints, once the frames are written."""
     of_frames: bool = False
@@ -46,22 +53,20 @@ class Own:
     """The frame of the video in which it is outlined; None: the clean picture."""
 
 
-def own_keypoints(
-    own: Own, clip: Clip, drift: Drift, say: Callable[[str], None]
-) -> Keypoints | None:
+def own_keypoints(video: Video, clip: Clip, drift: Drift, say: Say) -> Keypoints | None:
     """Joints of the frames that are taken (by their place in the clip), in steadied pixels.
 
     Raises:
         InputError: If the file cannot be read or has none of these frames.
     """
-    if own.keypoints is None:
+    if video.keypoints is None:
         return None
-    path = own.keypoints()
+    path = video.keypoints()
     found = _read_joints(path)
-    frames = clip.numbers if own.of_frames else clip.in_source
+    frames = clip.numbers if video.of_frames else clip.in_source
     rows, at = _taken(found.frame, frames, path, say)
     points = found.points[rows]
-    if not own.of_frames and drift.verdict != "still":
+    if not video.of_frames and drift.verdict != "still":
         for k, frame in enumerate(at.tolist()):
             points[k] = torch.from_numpy(
                 moved(np.linalg.inv(drift.H[frame].double().numpy()), points[k].numpy())
@@ -82,7 +87,7 @@ def _read_joints(path: Path) -> Keypoints:
     raise InputError(f"{first}; known are keypoints.npz and {', '.join(names('keypoints'))}")
 
 
-def own_masks(path: Path, clip: Clip, drift: Drift, say: Callable[[str], None]) -> People:
+def own_masks(path: Path, clip: Clip, drift: Drift, say: Say) -> People:
     """People's masks of the frames that are taken, as the steadied camera sees them.
 
     Raises:
@@ -106,20 +111,20 @@ def own_masks(path: Path, clip: Clip, drift: Drift, say: Callable[[str], None]) 
     return People(Masks(clip.height, clip.width, tuple(codes)), at[kept], person)
 
 
-def own_objects(own: Own, clip: Clip, drift: Drift) -> dict[str, Any]:
+def own_objects(video: Video, clip: Clip, drift: Drift) -> dict[str, Any]:
     """The fields of objects.json from outlines or boxes.
 
     Raises:
         InputError: If the file cannot be read, has another size or no object.
     """
-    assert own.objects is not None
+    assert video.objects is not None
     size = clip.width, clip.height
-    found = read_things(own.objects, {}, size, "reference.png")
+    found = read_things(video.objects, {}, size, "reference.png")
     items = list(found.items)
     if not items:
-        raise InputError(f"{own.objects.name}: has no furniture, expected outlines or boxes")
-    if own.objects_frame is not None:
-        frame = int((clip.in_source - own.objects_frame).abs().argmin())
+        raise InputError(f"{video.objects.name}: has no furniture, expected outlines or boxes")
+    if video.objects_frame is not None:
+        frame = int((clip.in_source - video.objects_frame).abs().argmin())
         items = [_moved_item(item, drift.H[frame], size) for item in items]
     tree = Instances(tuple(items), size, found.file).objects_tree().value
     return {**tree, "images": [{**tree["images"][0], "file_name": "reference.png"}]}
@@ -146,10 +151,7 @@ def _carried(mask: Bool[Tensor, "h w"], H: Float[Tensor, "3 3"]) -> Bool[Tensor,
 
 
 def _taken(
-    frames: Int[Tensor, " rows"],
-    wanted: Int[Tensor, " frames"],
-    path: Path,
-    say: Callable[[str], None],
+    frames: Int[Tensor, " rows"], wanted: Int[Tensor, " frames"], path: Path, say: Say
 ) -> tuple[Int[Tensor, " kept"], Int[Tensor, " kept"]]:
     """Rows of a file whose frame is taken, and its place in the clip.
 

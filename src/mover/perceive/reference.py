@@ -1,7 +1,7 @@
 """One picture of the room without people, put together from many, and the furniture in it."""
 
 from dataclasses import replace
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -9,13 +9,13 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mover.core.records import fingerprint, record
+from mover.core.records import record
 from mover.core.types import Detection, Masks, People
 from mover.geometry.crops import depth_in
-from mover.geometry.rle import decode, encode, tight_box
-from mover.perceive.networks import Finds, overlap, stack_of
+from mover.geometry.rle import decode, encode, mask_boxes
+from mover.perceive.networks import Finds
 from mover.perceive.steady import Drift, shown_by
-from mover.perceive.video import Clip, read_picture, write_jpeg
+from mover.perceive.video import Clip, read_picture
 
 FRAMES = 40  # most that are looked at, evenly over the video
 LEAST = 3  # fewest frames that show a pixel; with fewer it is hidden
@@ -70,17 +70,12 @@ def median(
     pictures: NDArray[np.uint8], shown: NDArray[np.bool_]
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Median over the frames (n, h, w, 3) that show a pixel, and which pixels too few show."""
-    times = shown.sum(0)
     found = np.empty(pictures.shape[1:], np.uint8)
     for rows in np.array_split(np.arange(len(found)), STRIPS):
-        values = np.where(shown[:, rows, :, None], pictures[:, rows].astype(np.int16), -1)
-        values.sort(0)
-        middle = (len(values) - times[rows] + (times[rows] - 1).clip(0) // 2).clip(
-            max=len(values) - 1
-        )
-        at = np.broadcast_to(middle[None, ..., None], (1, *values.shape[1:]))
-        found[rows] = np.take_along_axis(values, at, 0)[0].clip(0)
-    return found, times < LEAST
+        values = torch.from_numpy(pictures[:, rows]).float()
+        values[torch.from_numpy(~shown[:, rows])] = torch.nan
+        found[rows] = values.nanmedian(0).values.nan_to_num(0).byte().numpy()
+    return found, shown.sum(0) < LEAST
 
 
 def grown(mask: NDArray[np.bool_], steps: int) -> NDArray[np.bool_]:
@@ -90,27 +85,19 @@ def grown(mask: NDArray[np.bool_], steps: int) -> NDArray[np.bool_]:
     return depth_in(~mask) <= steps
 
 
-def clip_of_clean(clean: Clean, folder: Path) -> Clip:
-    """The clean picture as a clip of one frame, in which furniture is looked for."""
-    pixels = (clean.picture * 255).round().to(torch.uint8).numpy()
-    folder = folder / fingerprint(clean.picture)  # another picture is another input
-    folder.mkdir(parents=True, exist_ok=True)
-    write_jpeg(pixels, folder / "000000.jpg")
-    height, width = clean.hidden.shape
-    return Clip(str(folder), width, height, torch.zeros(1), None)
-
-
 def detections_in(finds: Finds) -> tuple[Detection, ...]:
     """Furniture as annotations; of finds that cover each other only the surest stays."""
-    masks = stack_of(finds.masks)
-    kept: list[int] = []
+    from pycocotools import mask as coco
+
+    size, kept = [finds.masks.height, finds.masks.width], list[int]()
+    codes: Any = [{"size": size, "counts": code} for code in finds.masks.counts]
+    boxes, overlap = mask_boxes(finds.masks), coco.iou(codes, codes, [0] * len(codes))
     for row in finds.score.argsort(descending=True).tolist():
-        near = overlap(masks[row][None], masks[kept]) if kept else torch.zeros(1, 0)
-        if finds.category[row] in THINGS and not bool((near > SAME).any()):
+        if finds.category[row] in THINGS and not any(overlap[row][k] > SAME for k in kept):
             kept.append(row)
     return tuple(
         Detection(
-            id=k, category=finds.category[row], box=tight_box(masks[row]),
+            id=k, category=finds.category[row], box=boxes[row],
             mask=replace(finds.masks, counts=(finds.masks.counts[row],)),
             score=float(finds.score[row]),
         )

@@ -54,13 +54,13 @@ class ScreenInputs:
     """Outermost points of each shape, from the centre of its bottom [m]."""
     height: float | None
     """The camera's, where it is given or a depth map shows it [m]."""
+    given: Given
+    """Along which axis each item may stand."""
     tilt_spread: float | None = None
     """How far off pitch and roll are, where the picture shows them [rad]."""
     prior: Gaussian | None = None
     """Pitch and roll [rad], logarithm of the height [m] by the feet of people; it takes the place
     of `height` and `tilt_spread`."""
-    given: Given | None = None
-    """Along which axis each item may stand; None: nothing is seen of it."""
 
 
 @record
@@ -197,8 +197,6 @@ def _each(
     box = bbox_term(project(verts, camera.K), boxes, sides, float(camera.width), "robust")
     size = SCALE * scale_term(guess.log_scale, "robust")
     energy = box + size + DEPTH * _off_depth(verts, inputs.depth[thing])
-    if inputs.given is None:
-        return energy
     return energy + AXIS * given_term(_standing(guess), inputs.given)
 
 
@@ -231,9 +229,7 @@ def _starts(inputs: ScreenInputs, heights: Tensor) -> ScreenGuess:
     usable = (rays[0][:, 1] < -0.02) & (inputs.sides[inputs.thing][:, 3] == SEEN) & (far < FARTHEST)
     distance = torch.where(usable, far, by_size.expand_as(far)).clamp(NEAREST, FARTHEST)
     t = distance[..., None] * torch.where(usable[..., None], rays[0], rays[1])
-    yaw = torch.arange(YAWS)[:, None] * (2 * math.pi / YAWS)
-    if inputs.given is not None:
-        yaw = yaw + inputs.given.axis
+    yaw = torch.arange(YAWS)[:, None] * (2 * math.pi / YAWS) + inputs.given.axis
     shape = (len(heights), YAWS, len(boxes))
     return ScreenGuess(
         t_world_object=t[:, None].expand(*shape, 3).clone(),

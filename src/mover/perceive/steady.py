@@ -16,6 +16,7 @@ from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mover.core.files import copy_whole
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
 from mover.perceive.video import Clip, read_picture, write_jpeg
@@ -236,7 +237,6 @@ def warnings_of(drift: Drift, time: Float[Tensor, " frames"]) -> list[str]:
 
 def steady_frames(clip: Clip, drift: Drift, folder: Path, observe: Observer = silent) -> Clip:
     """The frames as the reference frame's camera saw them; unchanged where the camera is still."""
-    folder.mkdir(parents=True, exist_ok=True)
     steady = replace(clip, folder=str(folder))
     kept = {steady.path(frame) for frame in range(len(clip.time))}
     for old in {*folder.glob("[0-9]*.jpg")} - kept:  # of another video
@@ -244,8 +244,7 @@ def steady_frames(clip: Clip, drift: Drift, folder: Path, observe: Observer = si
     for frame in range(len(clip.time)):
         path = steady.path(frame)
         if drift.verdict == "still":
-            path.unlink(missing_ok=True)
-            path.write_bytes(clip.path(frame).read_bytes())
+            copy_whole(clip.path(frame), path)
         else:
             H = drift.H[frame].double().numpy()
             write_jpeg(warp(read_picture(clip.path(frame)), H, (clip.height, clip.width)), path)

@@ -67,8 +67,7 @@ class Clip:
 
     def path(self, frame: int) -> Path:
         """The file of a frame, which is counted from 0 without gaps."""
-        number = frame if self.number is None else int(self.number[frame])
-        return Path(self.folder) / f"{number:06d}.jpg"
+        return Path(self.folder) / f"{int(self.numbers[frame]):06d}.jpg"
 
     def part(self, first: int, end: int) -> "Clip":
         """The frames from the first to before the end."""
@@ -108,13 +107,12 @@ def take_frames(inputs: TakeInputs, config: FramesConfig, observe: Observer = si
     Raises:
         InputError: If the source cannot be read, or its pictures differ in size.
     """
-    inputs.folder.mkdir(parents=True, exist_ok=True)
     for old in inputs.folder.glob("*.jpg"):  # of another source
         old.unlink()
     rows = list[tuple[float, int, int]]()
     size: tuple[int, int] | None = None
     fps = rate_of(inputs.source, config)
-    for number, (index, time, pixels) in chosen(read_frames(inputs.source, config), config, fps):
+    for number, (index, time, pixels) in chosen(read_frames(inputs.source), config, fps):
         picture = pixels()
         found = picture.shape[1], picture.shape[0]
         if size is not None and found != size:
@@ -133,19 +131,28 @@ def take_frames(inputs: TakeInputs, config: FramesConfig, observe: Observer = si
     return Clip(str(inputs.folder), *size, times, fps, origin, numbers, indices)
 
 
-def read_frames(source: Path, config: FramesConfig) -> Iterator[Timed]:
+def read_frames(source: Path) -> Iterator[Timed]:
     """Number, time [s] and pixels of each frame, upright.
 
     Raises:
         InputError: If it cannot be read.
     """
     if pictures := pictures_of(source):
-        rate = config.folder_fps or 1.0
         for index, path in enumerate(pictures):
-            yield index, index / rate, partial(read_picture, path)
+            yield index, float(index), partial(read_picture, path)
         return
     try:
-        yield from _decoded(source)
+        with _opened(source) as container:
+            stream = container.streams.video[0]
+            context = stream.codec_context
+            if context.width * context.height > LARGEST_AREA:
+                raise ValueError(f"{context.width} x {context.height} pixels are too many")
+            first = float((stream.start_time or 0) * stream.time_base)
+            rate = float(stream.average_rate or USUAL_RATE)
+            for index, frame in enumerate(container.decode(stream)):
+                stamped = frame.pts is not None  # the frames of a bare stream are not
+                time = float(frame.pts * frame.time_base) - first if stamped else index / rate
+                yield index, time, partial(_upright, frame)
     except (OSError, ValueError) as error:  # av's errors are of both kinds
         raise unreadable(source, error, "a video") from error
 
@@ -210,22 +217,22 @@ def write_jpeg(picture: Picture, path: Path) -> None:
 
 
 def rate_of(source: Path, config: FramesConfig) -> float | None:
-    """Frames a second of what is taken."""
-    known = config.folder_fps or None
-    if not pictures_of(source):
-        with _opened(source) as container:
-            stream = container.streams.video[0]
-            known = float(stream.average_rate or USUAL_RATE)
-            if not config.fps or known < config.fps:  # a pause or a late end spoils the average
-                try:
-                    packets = [p for p in container.demux(stream) if p.pts is not None]
-                except (OSError, ValueError):  # decoding will say so
-                    packets = []
-                gaps = np.diff(np.unique([float(p.pts * p.time_base) for p in packets]))
-                if len(gaps):
-                    near = np.abs(gaps - np.median(gaps)) < SAME_GAP * np.median(gaps)
-                    known = 1 / float(gaps[near].mean())
-    return known if known is None or not config.fps else min(known, config.fps)
+    """Frames a second of what is taken; None: of pictures in a folder it is not known."""
+    if pictures_of(source):
+        return None
+    with _opened(source) as container:
+        stream = container.streams.video[0]
+        known = float(stream.average_rate or USUAL_RATE)
+        if not config.fps or known < config.fps:  # a pause or a late end spoils the average
+            try:
+                packets = [p for p in container.demux(stream) if p.pts is not None]
+            except (OSError, ValueError):  # decoding will say so
+                packets = []
+            gaps = np.diff(np.unique([float(p.pts * p.time_base) for p in packets]))
+            if len(gaps):
+                near = np.abs(gaps - np.median(gaps)) < SAME_GAP * np.median(gaps)
+                known = 1 / float(gaps[near].mean())
+    return min(known, config.fps) if config.fps else known
 
 
 def _opened(source: Path) -> Any:  # noqa: ANN401
@@ -241,20 +248,6 @@ def _opened(source: Path) -> Any:  # noqa: ANN401
     if not container.streams.video:
         raise InputError(f"{source.name}: has no pictures, only sound, expected a video")
     return container
-
-
-def _decoded(source: Path) -> Iterator[Timed]:
-    with _opened(source) as container:
-        stream = container.streams.video[0]
-        context = stream.codec_context
-        if context.width * context.height > LARGEST_AREA:
-            raise ValueError(f"{context.width} x {context.height} pixels are too many")
-        first = float((stream.start_time or 0) * stream.time_base)
-        rate = float(stream.average_rate or USUAL_RATE)
-        for index, frame in enumerate(container.decode(stream)):
-            stamped = frame.pts is not None  # the frames of a bare stream are not
-            time = float(frame.pts * frame.time_base) - first if stamped else index / rate
-            yield index, time, partial(_upright, frame)
 
 
 def _upright(frame: Any) -> Picture:  # noqa: ANN401

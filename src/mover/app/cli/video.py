@@ -13,17 +13,17 @@ from mover.app import chain
 from mover.app.cli import config as flags
 from mover.app.cli import say
 from mover.app.cli.people import FitArgs, fit_into
+from mover.app.cli.run import THREADS, reconstruct_into
 from mover.core.errors import InputError
 from mover.core.settings import Index, float_in
-from mover.perceive.config import LayoutConfig, Lens, PerceiveConfig
-from mover.perceive.needs import check_needs
+from mover.perceive.config import LayoutConfig, PerceiveConfig
+from mover.perceive.needs import missing
 from mover.pipeline.presets import PRESETS
 
 if TYPE_CHECKING:
     from mover.perceive.capture import Finders
-    from mover.perceive.own import Own
+    from mover.perceive.own import Video
 
-THREADS = 1  # of torch, as in `run`
 NETWORK, MEDIAPIPE = "network", "mediapipe"
 
 
@@ -202,7 +202,7 @@ def video_to_room(
     if source.suffix.lower() in (".json", ".npz", ".pkl", ".txt"):
         raise InputError(f"{source}: is no video, expected one, or a folder of its pictures")
     flags.preset_named(args.preset, PRESETS)
-    chain.BodiesFrom(args.bodies, args.bodies_tool).check()
+    chain.check_bodies(args.bodies, args.bodies_tool)
     if finders is None:
         _check_needs(args, config)  # in the first second: nothing heavy is loaded yet
     from mover.perceive.video import pictures_of, read_picture, stamp_of
@@ -212,16 +212,13 @@ def video_to_room(
         read_picture(pictures[0])
         say(ONE_IMAGE)
     capture, steps = args.out / "capture", chain.steps_in(args.out, say, STEPS)
-    lens = args.camera, args.fov
-    own = [
-        args.people_masks,
-        args.objects,
-        None if chain.OUT in args.keypoints else Path(args.keypoints),
-    ]
-    seen = [str((str(source.resolve()), *stamp_of(source))), repr(config), *map(str, lens)]
-    seen += [args.keypoints, str(args.objects_frame), *("none" if p is None else p for p in own)]
+    joints = None if chain.OUT in args.keypoints else Path(args.keypoints)
+    files = (args.people_masks, args.objects, joints)
+    words = (repr(config), args.camera, args.fov, args.keypoints, args.objects_frame)
+    stamp = str((str(source.resolve()), *stamp_of(source)))
+    made_from = [stamp, *map(str, words), *("none" if file is None else file for file in files)]
     made = capture / "objects.json"
-    steps.do(STEPS[0], seen, made, lambda: _pictures(args, config, capture, finders))
+    steps.do(STEPS[0], made_from, made, lambda: _pictures(args, config, capture, finders))
     if not json.loads(made.read_text())["annotations"]:
         raise InputError(
             f"{capture / 'reference.png'}: the network finds no furniture in it, so there is "
@@ -242,13 +239,12 @@ def _pictures(
 
     from mover.app.cli.progress import Bar
     from mover.core.run import Run
-    from mover.perceive.capture import Finders, Video, perceive
+    from mover.perceive.capture import Finders, perceive
 
     torch.set_num_threads(THREADS)
     with Bar() as bar:
         run = Run(capture / "perceived", bar)
-        video = Video(args.source, Lens(args.camera, args.fov), _own(args, capture))
-        perceive(video, capture, config, run, say, finders or Finders())
+        perceive(_video(args, capture), capture, config, run, say, finders or Finders())
     say(f"{capture}: wrote frames/, reference.png, objects.json, people.json, camera.json")
 
 
@@ -256,7 +252,7 @@ def _check_needs(args: VideoArgs, config: PerceiveConfig) -> None:
     """Refuse to begin where what is still needed is missing; furniture may be outlined later.
 
     Raises:
-        InputError: With a line for each thing that is missing.
+        InputError: With a line for each thing that is missing, and what to do about it.
     """
     for path in (args.people_masks, args.objects):
         if path is not None and not path.exists():
@@ -269,12 +265,14 @@ def _check_needs(args: VideoArgs, config: PerceiveConfig) -> None:
         )
     masks = args.people_masks is None and args.keypoints != MEDIAPIPE
     kinds = [*(["masks"] if masks else []), *(["keypoints"] if args.keypoints == NETWORK else [])]
-    check_needs(config.models, kinds, mediapipe=args.keypoints == MEDIAPIPE)
+    lacking = missing(config.models, kinds, mediapipe=args.keypoints == MEDIAPIPE)
+    if lacking:
+        raise InputError("\n  ".join(["not on this machine:", *lacking]))
 
 
-def _own(args: VideoArgs, capture: Path) -> "Own":
-    """What the user hands in."""
-    from mover.perceive.own import Own
+def _video(args: VideoArgs, capture: Path) -> "Video":
+    """The video, and what the user hands in."""
+    from mover.perceive.own import Video
 
     def joints() -> Path:
         if chain.OUT not in args.keypoints:
@@ -285,31 +283,30 @@ def _own(args: VideoArgs, capture: Path) -> "Own":
         return out
 
     given = None if args.keypoints in (NETWORK, MEDIAPIPE) else joints
-    return Own(
-        given, "{frames}" in args.keypoints, args.keypoints == MEDIAPIPE, args.people_masks,
-        args.objects, args.objects_frame,
+    return Video(
+        args.source, args.camera, args.fov, given, "{frames}" in args.keypoints,
+        args.keypoints == MEDIAPIPE, args.people_masks, args.objects, args.objects_frame,
     )  # fmt: skip
 
 
 def _bodies(capture: Path, args: VideoArgs, steps: chain.Steps) -> None:
     """bodies.npz, where people are seen."""
-    bodies, keypoints = chain.BodiesFrom(args.bodies, args.bodies_tool), capture / "keypoints.npz"
-    made = capture / "bodies.npz"
+    keypoints, made = capture / "keypoints.npz", capture / "bodies.npz"
     if args.bodies == chain.FIT and not keypoints.is_file():
         say("warning: no keypoints were found, so there are no bodies")
         steps.undo(STEPS[1], made)
         return
     chain.write_heights(capture, args.height)
-    given = [] if args.bodies == chain.FIT or bodies.is_command else [Path(args.bodies)]
+    given = [] if args.bodies == chain.FIT or chain.OUT in args.bodies else [Path(args.bodies)]
     made_from = [keypoints, lens_in(capture), args.bodies, args.bodies_tool, *given]
     made_from += map(str, args.height)
 
-    def fit() -> None:
-        camera = capture / "camera.json"
-        fit_into(FitArgs(keypoints, camera, out=made, drop=True, height=args.height))
-
     def work() -> None:
-        chain.make_bodies(bodies, args.source, capture, fit)
+        if args.bodies == chain.FIT:
+            camera = capture / "camera.json"
+            fit_into(FitArgs(keypoints, camera, out=made, drop=True, height=args.height))
+        else:
+            chain.import_bodies(args.bodies, args.bodies_tool, args.source, capture)
 
     steps.do(STEPS[1], made_from, made, work, yours=args.bodies == chain.FIT)
 
@@ -338,7 +335,6 @@ def lens_in(capture: Path) -> str:
 
 def _room(capture: Path, args: VideoArgs) -> None:
     """The room and its report; its own stages are kept by themselves."""
-    from mover.app.cli.run import reconstruct_into
     from mover.app.results import Origin
     from mover.core.devices import device_of
     from mover.io.formats import read
