@@ -2,6 +2,7 @@
 
 import base64
 import dataclasses
+import io
 import json
 import math
 import re
@@ -23,7 +24,8 @@ from mover.app.report.plan import draw_top, extent_of
 from mover.app.report.scene_view import pack_view, thin, thin_choice
 from mover.app.report.tables import find_changes, metrics_table, objects_table
 from mover.core.colours import colour, css
-from mover.core.types import Bodies, Capture, Scene
+from mover.core.types import Capture, Scene
+from mover.geometry.boxes import box_of
 from mover.geometry.camera import to_camera, to_world
 from mover.geometry.placement import place_object
 from mover.geometry.raster import first_hit
@@ -36,22 +38,18 @@ FLAGS = [
 
 
 def bare(scene: Scene) -> ReportContent:
-    return ReportContent("bare", None, scene, scene)
+    return ReportContent("bare", None, {"initial": scene, "result": scene})
 
 
 def full() -> ReportContent:
-    bodies = walkers()
     values = {"iou3d": 0.3, "p2s": 0.2, "contact_f1": 0.1, "center_error": 0.5}
     better = {"iou3d": 0.6, "p2s": 0.1, "contact_f1": 0.5, "center_error": 0.1}
     each = [{"id": "sofa_0", "initial": values, "result": better}]
     return ReportContent(
         "A <b>room</b> & more",
         torch.linspace(0.2, 0.8, 360)[:, None, None].expand(360, 640, 3),
-        room(0.5, -0.1, -1.4),
-        room(0.05),
-        room(),
-        walkers(ground=-1.4),
-        bodies,
+        {"initial": room(0.5, -0.1, -1.4), "result": room(0.05), "truth": room()},
+        {"initial": walkers(ground=-1.4), "result": walkers()},
         {"initial": values, "result": better, "objects": each},
         ("table_0: nobody touches it <script>",),
         [
@@ -101,10 +99,8 @@ class TestOverlay:
         for x, line in ((0.0, True), (0.5, False)):
             point = to_camera(torch.tensor([x, GROUND, -3.5]), scene.camera.R_cam_world)
             u, v, w = (scene.camera.K @ point * 2).tolist()
-            patch = drawn[
-                int(2 * v / w) : int(2 * v / w) + 1, int(2 * u / w) - 1 : int(2 * u / w) + 2
-            ]
-            assert (patch.max() > 0.45) == line
+            row, column = int(2 * v / w), int(2 * u / w)
+            assert (drawn[row, column - 1 : column + 2].max() > 0.45) == line
 
     def test_of_a_capture_is_saved_as_a_picture(self, tmp_path: Path):
         image = torch.full((720, 1280, 3), 0.3)
@@ -127,10 +123,8 @@ class TestPlan:
         drawn = draw_top(Scene(camera(), GROUND, (turned,)))
         middle, turn = re.search(r"translate\((.*?)\) rotate\((.*?)\)", drawn).groups()
         assert [float(v) for v in middle.split()] == pytest.approx([1.0, -3.0])
-        start = re.search(
-            r'class="foot" d="M([-.\d]+) ([-.\d]+)h([-.\d]+)v([-.\d]+)h', drawn
-        ).groups()
-        x, z, width, depth = (float(v) for v in start)
+        foot = re.search(r'class="foot" d="M(\S+) ([-.\d]+)h([-.\d]+)v([-.\d]+)h', drawn).groups()
+        x, z, width, depth = (float(v) for v in foot)
         assert (x, z, width, depth) == pytest.approx((-0.2, 0.4, 0.4, -0.8))
         # the front, at the middle of the first edge, looks along +x: SVG turns x to z
         angle = math.radians(float(turn))
@@ -154,8 +148,7 @@ class TestTables:
         after = room(pitch=-0.3)
         moved = []
         for p in before.objects:
-            verts = place_object(p).verts
-            middle = (verts.amin(0) + verts.amax(0)) / 2
+            middle = box_of(p).center
             seen = to_camera(middle, before.camera.R_cam_world)
             step = to_world(seen, after.camera.R_cam_world) - middle
             moved.append(dataclasses.replace(p, t_world_object=p.t_world_object + step))
@@ -185,7 +178,8 @@ class TestTables:
         assert metrics_table({}) == ""
 
     def test_joins_evidence_to_its_object(self):
-        drawn = objects_table(room(0.3), room(), [{"id": "table_0", "mask_pixels": 4321}], None)
+        scenes = {"initial": room(0.3), "result": room()}
+        drawn = objects_table(scenes, [{"id": "table_0", "mask_pixels": 4321}], None)
         row = next(r for r in drawn.split("<tr>") if "table_0" in r)
         assert "4,321" in row
         assert drawn.count("4,321") == 1
@@ -211,8 +205,8 @@ class TestThinning:
 
 
 class TestView:
-    def unpack(self, view: Any) -> tuple[dict[str, Any], bytes]:
-        return json.loads(view.text), base64.b64decode(view.block)
+    def unpack(self, view: tuple[str, str]) -> tuple[dict[str, Any], bytes]:
+        return json.loads(view[0]), base64.b64decode(view[1])
 
     def test_bodies_come_back_within_a_millimetre(self):
         bodies = walkers(20, people=2)
@@ -242,8 +236,7 @@ class TestView:
         assert len(tree["meshes"]) == 3
 
     def test_long_videos_are_sampled_with_both_ends(self):
-        bodies = walkers(1000)
-        tree, _ = self.unpack(pack_view({"result": room()}, {"result": bodies}))
+        tree, _ = self.unpack(pack_view({"result": room()}, {"result": walkers(1000)}))
         frames = tree["people"]["frames"]
         assert len(frames) == 120
         assert (frames[0], frames[-1]) == (0, 2997)
@@ -267,9 +260,14 @@ class Addresses(HTMLParser):
         ]
 
 
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The text of a full page."""
+    return write_report(tmp_path_factory.mktemp("page"), full()).read_text()
+
+
 class TestPage:
-    def test_asks_for_nothing_outside_itself(self, tmp_path: Path):
-        page = write_report(tmp_path, full()).read_text()
+    def test_asks_for_nothing_outside_itself(self, page: str):
         addresses = Addresses()
         addresses.feed(page)
         assert all(a.startswith("data:") for a in addresses.found)
@@ -277,8 +275,7 @@ class TestPage:
         assert not re.search(r"@import|url\((?!data:)", page)
         assert "default-src 'none'" in page
 
-    def test_writes_what_the_user_named_as_text(self, tmp_path: Path):
-        page = write_report(tmp_path, full()).read_text()
+    def test_writes_what_the_user_named_as_text(self, page: str):
         assert "A &lt;b&gt;room&lt;/b&gt; &amp; more" in page
         assert "it &lt;script&gt;" in page
         assert not re.search(r"\{\{\w+\}\}", page)
@@ -316,8 +313,7 @@ class TestPage:
         )
         assert write_report(tmp_path, bare(dataclasses.replace(scene, objects=grown))).exists()
 
-    def test_has_one_colour_for_an_object_everywhere(self, tmp_path: Path):
-        page = write_report(tmp_path, full()).read_text()
+    def test_has_one_colour_for_an_object_everywhere(self, page: str):
         tint = css(colour(1))
         assert page.count(f"--tint:{tint}") == 3  # the table, and a group in either plan
         assert f'"colour":"{tint}"' in page
@@ -352,8 +348,6 @@ class Visit:
             self.troubles.append(url)
 
     def see(self, what: str = "#stage canvas") -> np.ndarray:
-        import io
-
         self.page.wait_for_timeout(200)
         raw = self.page.locator(what).screenshot()
         return np.asarray(Image.open(io.BytesIO(raw)).convert("RGB")).astype(int)
@@ -410,7 +404,7 @@ class TestBrowser:
             visit.page.uncheck(f"[data-show={name}]")
         visit.page.click("[data-look=camera]")
         view = visit.see()
-        scene = content.result
+        scene = content.scenes["result"]
         fit = min(view.shape[1] / 640, view.shape[0] / 360)
         shift = [(view.shape[1] - fit * 640) / 2, (view.shape[0] - fit * 360) / 2]
         for index, p in enumerate(scene.objects):
@@ -443,10 +437,9 @@ class TestBrowser:
             visit.page.click(f"[data-look={look}]")
         assert visit.troubles == []
 
-    @pytest.mark.parametrize("peopled", ["initial_bodies", "bodies"])
-    def test_people_of_one_world_alone_are_drawn(self, browser, tmp_path: Path, peopled: str):
-        none: dict[str, Bodies | None] = {"initial_bodies": None, "bodies": None}
-        content = dataclasses.replace(full(), **(none | {peopled: walkers(5, 2)}))
+    @pytest.mark.parametrize("world", ["initial", "result"])
+    def test_people_of_one_world_alone_are_drawn(self, browser, tmp_path: Path, world: str):
+        content = dataclasses.replace(full(), bodies={world: walkers(5, 2)})
         visit = Visit(browser, write_report(tmp_path, content), reduced_motion="reduce")
         shown = visit.see()
         visit.page.uncheck("[data-show=people]")
@@ -467,13 +460,9 @@ class TestBrowser:
         sides = np.concatenate([before[:, :4], before[:, -4:]])
         assert np.ptp(sides, axis=-1).max() < 30  # grey: no furniture is cut at either side
         hand = visit.page.context.new_cdp_session(visit.page)
-        for kind, gap in (
-            ("touchStart", 40),
-            ("touchMove", 70),
-            ("touchMove", 120),
-            ("touchEnd", None),
-        ):
-            points = [] if gap is None else [{"x": 190 - gap, "y": 350}, {"x": 190 + gap, "y": 350}]
+        moves = [("touchStart", [40]), ("touchMove", [70]), ("touchMove", [120]), ("touchEnd", [])]
+        for kind, gaps in moves:
+            points = [{"x": 190 + side * gap, "y": 350} for gap in gaps for side in (-1, 1)]
             hand.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
         assert differ(before, visit.see()) > 0.05  # two fingers zoom
         assert visit.troubles == []

@@ -100,14 +100,16 @@ def report_of(
     metrics: dict[str, Any] | None = None,
 ) -> ReportContent:
     """What the report shows."""
+    scenes, people = {"initial": room.initial, "result": room.scene}, dict[str, Bodies]()
+    if truth is not None:
+        scenes["truth"] = truth
+    if room.bodies is not None:
+        people = {"initial": initial_bodies(capture), "result": room.bodies}
     return ReportContent(
         title=capture.name.encode("utf-8", "surrogateescape").decode("utf-8", "replace"),
         image=capture.reference,
-        initial=room.initial,
-        result=room.scene,
-        truth=truth,
-        initial_bodies=None if room.bodies is None else initial_bodies(capture),
-        bodies=room.bodies,
+        scenes=scenes,
+        bodies=people,
         metrics=metrics,
         warnings=room.warnings,
         estimates=room.estimates,

@@ -20,7 +20,7 @@ from mover.app.pictures.film import pixels
 from mover.app.pictures.overlay import canvas, draw_overlay, on_cpu
 from mover.app.report import asset, fill
 from mover.app.report.plan import draw_top, extent_of
-from mover.app.report.scene_view import ReportScene, pack_view
+from mover.app.report.scene_view import pack_view
 from mover.app.report.tables import (
     find_changes,
     metric_of,
@@ -42,11 +42,9 @@ class ReportContent:
 
     title: str
     image: Float[Tensor, "h w 3"] | None  #: the reference image, in [0, 1]
-    initial: Scene
-    result: Scene
-    truth: Scene | None = None
-    initial_bodies: Bodies | None = None  #: people in the world of `initial`
-    bodies: Bodies | None = None  #: people in the world of `result`
+    scenes: Mapping[str, Scene]  #: `initial` and `result`, and the `truth` where it is known
+    bodies: Mapping[str, Bodies] = field(default_factory=lambda: {})
+    """People in the worlds of `initial` and `result`."""
     metrics: Mapping[str, Any] | None = None  #: what metrics.json holds
     warnings: tuple[str, ...] = ()
     stages: Sequence[Mapping[str, Any]] = ()
@@ -62,10 +60,11 @@ class ReportContent:
     @property
     def peopled(self) -> bool:
         """Whether there are people to show."""
-        return any(b is not None and len(b.verts) > 0 for b in (self.initial_bodies, self.bodies))
+        return any(len(bodies.verts) > 0 for bodies in self.bodies.values())
 
 
 QUALITY = 87  # of a JPEG
+SIDES = {"Before": "initial", "After": "result"}
 TILES = ("iou3d", "center_error", "contact_f1", "pitch_error")
 
 
@@ -80,12 +79,13 @@ def write_report(out: Path, content: ReportContent) -> Path:
 
 def _page(content: ReportContent) -> str:
     """The whole text."""
-    scenes, worlds = (content.initial, content.result), (content.initial_bodies, content.bodies)
-    extent = extent_of(*scenes, *worlds, content.truth)
-    scores = [(content.metrics or {}).get(key) or {} for key in ("initial", "result")]
+    scenes, people, sides = content.scenes, content.bodies, list(SIDES.values())
+    extent = extent_of(*scenes.values(), *people.values())
+    scores = [(content.metrics or {}).get(side) or {} for side in sides]
     metrics = [(key, metric_of(key)) for key in TILES if key in scores[1]]
-    view, (before, after) = beside(
-        lambda: _view(content), lambda: mapped(lambda s: _overlay(content, s), scenes)
+    (text, block), (before, after) = beside(
+        lambda: pack_view(scenes, people),
+        lambda: mapped(lambda side: _overlay(content.image, scenes[side]), sides),
     )
     return fill(
         "page.html",
@@ -100,31 +100,29 @@ def _page(content: ReportContent) -> str:
         before=before,
         after=after,
         plans=[
-            (name, draw_top(scene, content.truth, people, extent=extent))
-            for name, scene, people in zip(("Before", "After"), scenes, worlds, strict=True)
+            (name, draw_top(scenes[side], scenes.get("truth"), people.get(side), extent=extent))
+            for name, side in SIDES.items()
         ],
         tables=(
             ("How far from the truth", metrics_table(content.metrics or {})),
-            (
-                "Objects",
-                objects_table(content.initial, content.result, content.objects, content.metrics),
-            ),
+            ("Objects", objects_table(scenes, content.objects, content.metrics)),
         ),
         longest=max([float(s.get("seconds") or 0) for s in content.stages], default=0.0) or 1.0,
         settings=settings_of(content.config),
-        view=view,
+        text=text,
+        block=block,
     )
 
 
 def lead(content: ReportContent) -> str:
     """What the run was given, in a sentence, and what it did, in another."""
-    parts = [_count(len(content.result.objects), "object", "objects")]
-    if content.bodies is not None:
-        parts.append(_count(len(content.bodies.person.unique()), "person", "people"))
-        parts.append(_count(len(content.bodies.frame.unique()), "frame", "frames"))
-    changes = sorted(c.moved for c in find_changes(content.initial, content.result).values())
+    scenes = [content.scenes[side] for side in SIDES.values()]
+    parts = [_count(len(scenes[1].objects), "object", "objects")]
+    if (people := content.bodies.get("result")) is not None:
+        parts.append(_count(len(people.person.unique()), "person", "people"))
+        parts.append(_count(len(people.frame.unique()), "frame", "frames"))
+    changes = sorted(c.moved for c in find_changes(*scenes).values())
     did = [f"furniture moved {100 * changes[len(changes) // 2]:.0f} cm (median)"] if changes else []
-    scenes = (content.initial, content.result)
     tilts = [math.degrees(float(pitch_roll(s.camera.R_cam_world)[0])) for s in scenes]
     texts = [f"{round(t, 1) + 0.0:.1f}".replace("-", "\N{MINUS SIGN}") for t in tilts]
     camera = f"camera pitch {_from_to(texts)}°"
@@ -143,18 +141,8 @@ def _count(number: int, one: str, many: str) -> str:
     return f"{number:,} {one if number == 1 else many}"
 
 
-def _view(content: ReportContent) -> ReportScene:
-    """The 3D view's data."""
-    scenes = {"initial": content.initial, "result": content.result, "truth": content.truth}
-    people = {"initial": content.initial_bodies, "result": content.bodies}
-    return pack_view(
-        {name: scene for name, scene in scenes.items() if scene is not None},
-        {name: bodies for name, bodies in people.items() if bodies is not None},
-    )
-
-
-def _overlay(content: ReportContent, scene: Scene) -> str:
+def _overlay(image: Float[Tensor, "h w 3"] | None, scene: Scene) -> str:
     """The image with the furniture drawn over it, as a JPEG that stands in the page itself."""
-    image, file = draw_overlay(canvas(content.image, scene), scene), io.BytesIO()
-    Image.fromarray(pixels(image)).save(file, "JPEG", quality=QUALITY, subsampling=0)
+    drawn, file = draw_overlay(canvas(image, scene), scene), io.BytesIO()
+    Image.fromarray(pixels(drawn)).save(file, "JPEG", quality=QUALITY, subsampling=0)
     return "data:image/jpeg;base64," + base64.b64encode(file.getvalue()).decode()

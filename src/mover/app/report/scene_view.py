@@ -2,6 +2,7 @@
 
 import base64
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,16 +61,13 @@ def thin_choice(
     return Thinning(used, ends) if few is None else Thinning(used[few[0]], few[1])
 
 
-@dataclass(frozen=True)
-class ReportScene:
-    """Data of the 3D view."""
+def pack_view(scenes: Mapping[str, Scene], bodies: Mapping[str, Bodies]) -> tuple[str, str]:
+    """Pack the scenes (`initial`, `result`, `truth`) and the bodies in the world of each.
 
-    text: str  #: JSON: placements, cameras, and where each array lies in `block`
-    block: str  #: little-endian arrays, base64: 16-bit vertices in steps from a middle, and faces
-
-
-def pack_view(scenes: dict[str, Scene], bodies: dict[str, Bodies]) -> ReportScene:
-    """Pack the scenes (`initial`, `result`, `truth`) and the bodies in the world of each."""
+    Returns:
+        JSON with placements, cameras, and where each array lies in a block; and the block, base64:
+        little-endian arrays, 16-bit vertices in steps from a middle, and faces.
+    """
     block, meshes, packed = bytearray(), list[Mesh](), list[dict[str, Any]]()
 
     def index_of(mesh: Mesh) -> int:
@@ -111,7 +109,7 @@ def pack_view(scenes: dict[str, Scene], bodies: dict[str, Bodies]) -> ReportScen
     name = "result" if "result" in scenes else next(iter(scenes))
     tree["room"] = _room(scenes[name], bodies.get(name))
     text = json.dumps(tree, separators=(",", ":")).replace("<", "\\u003c")
-    return ReportScene(text, base64.b64encode(bytes(block)).decode())
+    return text, base64.b64encode(bytes(block)).decode()
 
 
 def _added(array: Tensor, block: bytearray) -> int:
@@ -166,7 +164,7 @@ def _room(scene: Scene, bodies: Bodies | None) -> dict[str, Any]:
     return {"middle": _numbers((low + high) / 2), "radius": radius}
 
 
-def _packed_people(bodies: dict[str, Bodies], block: bytearray) -> dict[str, Any] | None:
+def _packed_people(bodies: Mapping[str, Bodies], block: bytearray) -> dict[str, Any] | None:
     """Evenly chosen frames of all people, in each world, with one thinned topology."""
     bodies = {name: b for name, b in bodies.items() if len(b.verts)}
     if not bodies:

@@ -58,16 +58,6 @@ def write_value(value: Any) -> str:  # noqa: ANN401
             return str(value)
 
 
-def is_number(value: Any) -> bool:  # noqa: ANN401
-    """Whether a plain value is a number, not a truth value."""
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def signed(value: float, digits: int) -> str:
-    """A number with its sign, a true minus."""
-    return f"{value:+.{digits}f}".replace("-", "\N{MINUS SIGN}")
-
-
 JUDGED = {"iou3d": "3D IoU", "center_error": "Centre error"}  # beside each object
 
 
@@ -117,7 +107,8 @@ def metrics_table(metrics: Mapping[str, Any]) -> str:
     """Each metric before and after, coloured by whether it became better."""
     before, after = metrics.get("initial") or {}, metrics.get("result") or {}
     every = dict.fromkeys((*(k for k in QUANTITIES if k in before or k in after), *before, *after))
-    keys = [k for k in every if k in QUANTITIES or is_number(before.get(k, after.get(k)))]
+    kinds = {k: type(before.get(k, after.get(k))) for k in every}
+    keys = [k for k in every if k in QUANTITIES or kinds[k] in (int, float)]
     rows = [_metric_row(k, before.get(k), after.get(k)) for k in keys]
     return draw_table([Cell("Metric", "text"), *map(Cell, ("Before", "After", "Change"))], rows)
 
@@ -138,13 +129,12 @@ def _metric_row(key: str, before: float | None, after: float | None) -> list[Cel
 
 
 def objects_table(
-    initial: Scene,
-    result: Scene,
+    scenes: Mapping[str, Scene],
     rows: Sequence[Mapping[str, Any]],
     metrics: Mapping[str, Any] | None,
 ) -> str:
     """What happened to each object, and the evidence and numbers that `rows` give for it."""
-    changes = find_changes(initial, result)
+    changes = find_changes(scenes["initial"], scenes["result"])
     extra = {str(row.get("id")): row for row in rows}
     fields = list(dict.fromkeys(k for row in rows for k in row if k not in ("id", "category")))
     scores = {str(o.get("id")): o for o in (metrics or {}).get("objects") or ()}
@@ -152,9 +142,9 @@ def objects_table(
     titles = ["Moved", "Turned", "Size", *(JUDGED[k] for k in judged)]
     titles += [f.replace("_", " ") for f in fields]
     lines: list[list[Cell]] = []
-    for index, item in enumerate(result.objects):
+    for index, item in enumerate(scenes["result"].objects):
         sides = [(scores.get(item.id) or {}).get(side) or {} for side in ("initial", "result")]
-        values = [*_change_cells(changes.get(item.id))]
+        values = _change_cells(changes.get(item.id))
         for key in judged:
             before, after = (side.get(key) for side in sides)
             unit = metric_of(key).unit
@@ -165,13 +155,13 @@ def objects_table(
     return draw_table([Cell("Object"), Cell("Category", "text"), *map(Cell, titles)], lines)
 
 
-def _change_cells(change: Change | None) -> tuple[str, str, str]:
+def _change_cells(change: Change | None) -> list[str]:
     if change is None:
-        return ("new", NOTHING, NOTHING)
-    grown = [signed(100 * (g - 1), 0) for g in change.grown]
-    size = f"{grown[0]} %" if len(set(grown)) == 1 else f"{' / '.join(grown)} %"
-    turned = f"{signed(math.degrees(change.turned), 1)}°"
-    return (f"{100 * change.moved:.0f} cm", turned, size)
+        return ["new", NOTHING, NOTHING]
+    grown = [f"{100 * (g - 1):+.0f}" for g in change.grown]
+    size = grown[0] if len(set(grown)) == 1 else " / ".join(grown)
+    cells = [f"{100 * change.moved:.0f} cm", f"{math.degrees(change.turned):+.1f}°", f"{size} %"]
+    return [cell.replace("-", "\N{MINUS SIGN}") for cell in cells]
 
 
 def settings_of(config: Mapping[str, Any], above: str = "") -> list[tuple[str, str]]:
