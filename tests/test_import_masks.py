@@ -152,7 +152,7 @@ def of_boxes(room: layouts.Room, things: list[layouts.Thing], path: Path, **more
 
 def command(home: Path, kind: str, source: Path, **given: Any) -> Capture:
     """What `mover import` leaves in out/."""
-    run_import(ImportArgs(kind, source, home / "out", **given), home)
+    run_import(ImportArgs(kind, source, home / "out", **given))
     return read_capture(home / "out")
 
 
@@ -170,7 +170,7 @@ def test_parts_come_in_any_order_and_stay(plain, tmp_path):
     found = []
     for name, order in (("a", ("total3d", "masks")), ("b", ("masks", "total3d"))):
         for step in order:
-            run_import(ImportArgs(step, sources[step], tmp_path / name), tmp_path)
+            run_import(ImportArgs(step, sources[step], tmp_path / name))
         found.append(read_capture(tmp_path / name))
     for capture in found:
         assert all(d.mask is not None for d in capture.detections)
@@ -227,7 +227,7 @@ def test_people_keep_their_tracks_and_frames(plain, tmp_path, tracks):
 
 def test_masks_alone_make_a_part_and_what_is_missing_is_said(tmp_path, capsys):
     files = layouts.write_masks(tmp_path / "in", drawn(), WORDS)
-    run_import(ImportArgs("masks", files["coco_text"], tmp_path / "out"), tmp_path)
+    run_import(ImportArgs("masks", files["coco_text"], tmp_path / "out"))
     said = capsys.readouterr().out
     assert "wrote objects.json" in said
     for word in ("camera.json", "scene.json", "bodies.npz", "people.json", "reference.jpg"):

@@ -127,13 +127,13 @@ def chosen_config(arguments: Sequence[str], table: Mapping[Any, T]) -> T:
     return config
 
 
-def parsed(kind: Callable[..., T], prog: str, arguments: Sequence[str], *markers: Any) -> T:  # noqa: ANN401
+def parsed(kind: Callable[..., T], prog: str, arguments: Sequence[str]) -> T:
     """The arguments of a command as its dataclass, checked before any work starts.
 
     Raises:
         InputError: If a setting is out of its range.
     """
-    found = tyro.cli(kind, prog=prog, args=list(arguments), config=markers)
+    found = tyro.cli(kind, prog=prog, args=list(arguments))
     _checked(prog, found)
     return found
 

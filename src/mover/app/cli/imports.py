@@ -1,11 +1,10 @@
 """What `import` does."""
 
-import dataclasses
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
@@ -81,42 +80,36 @@ class ImportArgs:
 
 def import_(arguments: Sequence[str]) -> None:
     """`mover import`."""
-    args = parsed(ImportArgs, "mover import", arguments)
-    chosen("FORMAT", args.format, *IMPORTED)
-    with tempfile.TemporaryDirectory(prefix="mover-import-") as work:
-        run_import(args, Path(work))
+    run_import(parsed(ImportArgs, "mover import", arguments))
 
 
-def run_import(args: ImportArgs, work: Path) -> None:
-    """Import one source; `work` is a folder for meshes on the way."""
+def run_import(args: ImportArgs) -> None:
+    """Import one source, and say what the capture has and lacks."""
+    read = chosen("FORMAT", args.format, *IMPORTED)
     from mover.io.capture.merge import import_into
 
-    hints = _hints(args, work)
-    main: Parts = chosen("FORMAT", args.format, *IMPORTED)(args.source, hints)
-    imported = import_into(args.out, *_parts(args, main, hints))
-    print_import(imported, args.out)
+    with tempfile.TemporaryDirectory(prefix="mover-import-") as work:  # of meshes on the way
+        hints = _hints(args, Path(work))
+        main: Parts = read(args.source, hints)
+        _print_import(import_into(args.out, *_parts(args, main, hints)), args.out)
 
 
 def _hints(args: ImportArgs, work: Path) -> "Hints":
     """What the options say; a camera of the folder counts where none is given."""
     from mover.io.capture.folder import folder_parts
-    from mover.io.capture.parts import Hints
+    from mover.io.capture.parts import Hints, Parts
     from mover.io.files.cameras import guessed_view, read_camera_file
     from mover.io.files.images import image_size
 
-    size = None if args.image is None else image_size(args.image)
-    camera: At | None = None
-    old = folder_parts(args.out) if args.out.is_dir() else None
-    if size is None and old is not None:
-        size = old.image_size
+    old = folder_parts(args.out) if args.out.is_dir() else Parts(name="")
+    size = old.image_size if args.image is None else image_size(args.image)
+    camera = old.camera
     if args.camera is not None:
         camera = read_camera_file(args.camera, size)
     elif args.fov is not None:
         if size is None:
             raise InputError("--fov: needs the size of the image, expected --image too")
         camera = guessed_view(args.fov, size)
-    elif old is not None:
-        camera = old.camera
     if args.recording and args.recordings:
         raise InputError("--recording, --recordings: both are given, expected one of them")
     names = [item.partition("=") for item in args.names]
@@ -133,29 +126,17 @@ def _hints(args: ImportArgs, work: Path) -> "Hints":
 def _parts(args: ImportArgs, main: "Parts", hints: "Hints") -> "list[Parts]":
     """The source and what the options add."""
     import numpy as np
-    import torch
 
-    from mover.io.capture.bodies_file import read_body_arrays
     from mover.io.capture.parts import Parts, image_parts
-    from mover.io.capture.tracks import renumbered
-    from mover.io.files.fields import At
     from mover.io.files.npz import read_npz
 
-    found = [main]
-    extra = Parts(name=args.out.name)
+    lens, extra = main.camera or hints.camera, dict[str, Any]()
     if args.camera is not None or args.fov is not None:
-        extra = dataclasses.replace(extra, camera=hints.camera)
+        extra["camera"] = lens = hints.camera
     if args.image is not None:
-        load, size = image_parts(args.image)
-        extra = dataclasses.replace(extra, load_image=load, image_size=size)
+        extra["load_image"], extra["image_size"] = image_parts(args.image)
     if args.bodies is not None:
-        bodies = read_body_arrays(args.bodies, args.fps) if not args.bodies_from else None
-        if bodies is not None and args.tracks:
-            person = renumbered(torch.from_numpy(bodies.get("person").array(("B",), "whole")),
-                                tracks_of(args.tracks))  # fmt: skip
-            bodies = At({**bodies.value, "person": person.numpy()}, bodies.file)
-        bodies = bodies or _bodies_of_tool(args, [*found, extra], hints)
-        extra = dataclasses.replace(extra, bodies=bodies)
+        extra["bodies"] = _bodies(args, args.bodies, lens)
     if args.cameras is not None:
         tool = args.cameras_from
         if not tool and args.cameras.suffix.lower() != ".npz":
@@ -165,60 +146,64 @@ def _parts(args: ImportArgs, main: "Parts", hints: "Hints") -> "list[Parts]":
         read = chosen("--cameras-from", tool, "cameras") if tool else read_npz
         poses: At = read(args.cameras)
         if args.reference_frame is not None:
-            number = np.array(args.reference_frame)
-            poses = dataclasses.replace(poses, value={**poses.value, "reference": number})
-        extra = dataclasses.replace(extra, cameras=poses)
-    return [*found, extra, *_masks(args, [*found, extra], hints)]
+            poses = poses.holding({**poses.value, "reference": np.array(args.reference_frame)})
+        extra["cameras"] = poses
+    return [main, Parts(name=args.out.name, **extra), *_masks(args, main, lens, hints)]
 
 
-def _bodies_of_tool(args: ImportArgs, parts: "Sequence[Parts]", hints: "Hints") -> "At":
-    """Bodies of another tool, as the arrays of bodies.npz."""
-    from mover.io.capture.bodies_file import bodies_to_arrays
+def _bodies(args: ImportArgs, file: Path, lens: "At | None") -> "At":
+    """The arrays of bodies.npz: of the file itself, or of the tool that wrote it."""
+    import torch
+
+    from mover.io.capture.bodies_file import bodies_to_arrays, read_body_arrays
     from mover.io.capture.camera_file import camera_of
+    from mover.io.capture.tracks import renumbered
     from mover.io.files.fields import At
     from mover.io.people.bodies import bodies_from
     from mover.io.people.found import Known
 
-    assert args.bodies is not None
+    if not args.bodies_from:
+        own = read_body_arrays(file, args.fps)
+        if not args.tracks:
+            return own
+        person = torch.from_numpy(own.get("person").array(("B",), "whole"))
+        person = renumbered(person, tracks_of(args.tracks)).numpy()
+        return own.holding({**own.value, "person": person})
     chosen("--bodies-from", args.bodies_from, "people")
-    lens = next((p.camera for p in reversed(parts) if p.camera is not None), hints.camera)
     camera = None if lens is None else camera_of(lens)
     known = Known(camera, fps=args.fps, gender=args.gender, tracks=tracks_of(args.tracks))
-    found = bodies_from(args.bodies_from, args.bodies, known)
+    found = bodies_from(args.bodies_from, file, known)
     for text in found.warnings:
         say(f"note: {text}")
-    return At(bodies_to_arrays(found.bodies), args.bodies.name)
+    return At(bodies_to_arrays(found.bodies), file.name)
 
 
-def _masks(args: ImportArgs, parts: "Sequence[Parts]", hints: "Hints") -> "list[Parts]":
+def _masks(args: ImportArgs, main: "Parts", lens: "At | None", hints: "Hints") -> "list[Parts]":
     """Masks of the options, in an image of the camera's size; people too where none has a name."""
     from mover.io.capture.parts import Parts
     from mover.io.files.images import image_size
     from mover.io.masks.instance_files import read_people, read_things
     from mover.io.masks.instances import with_reference_people
 
-    camera = next((p.camera for p in reversed(parts) if p.camera is not None), hints.camera)
-    size = None if camera is None else (camera.value.get("w"), camera.value.get("h"))
-    shape = None if hints.image is None else image_size(hints.image)
-    shape = shape or (None if camera is None else size)
-    found: list[Parts] = []
+    size = None if lens is None else (lens.value.get("w"), lens.value.get("h"))
+    shape = size if hints.image is None else image_size(hints.image)
+    found, people = list[Parts](), main.people
     if args.objects_masks is not None:
         picture = "" if args.image is None else args.image.name
         masks = read_things(args.objects_masks, hints.names, shape, picture, fit=size)
-        tree = masks.objects_tree()
-        found.append(Parts(name="", objects=tree, notes=masks.notes))
+        found.append(Parts(name="", objects=masks.objects_tree(), notes=masks.notes))
     if args.people_masks is not None:
         masks = read_people(args.people_masks, hints.names, shape, size)
-        found.append(Parts(name="", people=masks.people_tree(args.fps), notes=masks.notes))
+        people = masks.people_tree(args.fps)
+        found.append(Parts(name="", people=people, notes=masks.notes))
     if args.reference_people is not None:
         masks = read_things(args.reference_people, hints.names, shape, fit=size, people=True)
-        people = next((p.people for p in reversed([*parts, *found]) if p.people is not None), None)
-        tree = with_reference_people(people, masks, args.out)
-        found.append(Parts(name="", people=tree, notes=masks.notes))
+        people = with_reference_people(people, masks, args.out)
+        found.append(Parts(name="", people=people, notes=masks.notes))
     return found
 
 
-def print_import(imported: "Imported", folder: Path) -> None:
+def _print_import(imported: "Imported", folder: Path) -> None:
     """Say what the capture has and what it lacks."""
     from mover.io.capture.evidence import evidence_table, gather_evidence
     from mover.io.capture.faults import check_against_picture
