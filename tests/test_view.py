@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import io
 import json
 import math
 import os
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from test_pipeline import light
 from test_report import browser, differ
 
@@ -24,6 +26,7 @@ from mover.energy.config import Adam
 from mover.geometry.boxes import box_of
 from mover.geometry.rotations import rot_y
 from mover.io.capture.edits import Pin, Place, edit_scene, placement_of, read_edits, write_edits
+from mover.io.capture.folder import write_capture
 from mover.io.capture.scene_file import read_scene
 from mover.io.files.fields import write_json
 
@@ -32,19 +35,19 @@ SQUARE = 0.9 / 7 * 1.7  # [m] along x and z, from the foot of the gizmo to its s
 SIZE = {"width": 1280, "height": 800}
 
 
+def program(*arguments: object) -> dict[str, Any]:
+    """The program as a user calls it, for `subprocess`."""
+    words = [sys.executable, "-m", "mover", *map(str, arguments)]
+    return {"args": words, "env": dict(os.environ, OMP_NUM_THREADS="1")}
+
+
 def call(*arguments: object) -> None:
-    """Run the program as a user does."""
-    subprocess.run(
-        [sys.executable, "-m", "mover", *map(str, arguments)],
-        check=True, capture_output=True, env=dict(os.environ, OMP_NUM_THREADS="1"),
-    )  # fmt: skip
+    subprocess.run(**program(*arguments), check=True, capture_output=True)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, small_capture) -> Path:
     """A small capture, its settings, and its result in `out`."""
-    from mover.io.capture.folder import write_capture
-
     folder = tmp_path_factory.mktemp("view")
     write_capture(small_capture, folder / "capture")
     config, slow = light("robust"), Adam(15, 0.03)
@@ -70,10 +73,7 @@ class Viewer:
     def __init__(self, browser: Any, shots: Path, *arguments: object) -> None:
         pytest.importorskip("viser")
         self.shots, self.troubles, self.requests = shots, [], []
-        self.server = subprocess.Popen(
-            [sys.executable, "-m", "mover", *map(str, arguments)],
-            stdout=subprocess.PIPE, text=True, env=dict(os.environ, OMP_NUM_THREADS="1"),
-        )  # fmt: skip
+        self.server = subprocess.Popen(**program(*arguments), stdout=subprocess.PIPE, text=True)
         self.url = self.server.stdout.readline().split()[0]
         self.page = browser.new_page(viewport=SIZE)
         self.page.on("console", lambda m: self.troubles.append(m.text) if m.type == "error" else 0)
@@ -88,10 +88,6 @@ class Viewer:
 
     def see(self, name: str, wait: int = 2000) -> np.ndarray:
         """The 3D view as it is now; also kept as a file to look at."""
-        import io
-
-        from PIL import Image
-
         self.page.wait_for_timeout(wait)
         raw = self.page.screenshot(path=self.shots / f"{name}.png")
         whole = np.asarray(Image.open(io.BytesIO(raw)).convert("RGB")).astype(int)

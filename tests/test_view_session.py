@@ -2,7 +2,9 @@
 
 import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from little_room import GROUND, room, walkers
@@ -10,6 +12,7 @@ from little_room import GROUND, room, walkers
 from mover.app.viewer.drawing import DrawnPeople
 from mover.app.viewer.panels import numbers_of
 from mover.app.viewer.session import Shown, start_session
+from mover.core.records import rows_of
 from mover.io.capture.edits import Delete, Place, placement_of, read_edits, write_edits
 
 
@@ -60,10 +63,25 @@ def test_the_table_of_an_object_has_position_change_and_evidence():
 
 
 def test_people_are_found_by_frame_and_person():
-    bodies, people = walkers(5, people=2), DrawnPeople(None)
+    drawn = {}
+
+    def add(name, verts, _faces, **_looks):
+        drawn[name] = SimpleNamespace(vertices=verts, remove=lambda: drawn.pop(name))
+        return drawn[name]
+
+    people = DrawnPeople(SimpleNamespace(scene=SimpleNamespace(add_mesh_simple=add)))
+    bodies = rows_of(walkers(5, people=2), torch.arange(9))  # the last frame lacks the second
     people.replace(bodies)
     assert people.frames == [0, 3, 6, 9, 12]
-    assert bodies.person[people.rows[(6, 1)]] == 1
-    assert bodies.frame[people.rows[(6, 1)]] == 6
+    for moment, frame in ((2, 6), (4, 12), (9, 12), (1, 3)):
+        people.show(moment)
+        for person in (0, 1):
+            row = ((bodies.frame == frame) & (bodies.person == person)).nonzero()[:, 0]
+            handle = drawn[f"/people/{person}"]
+            assert handle.visible == bool(len(row))
+            if len(row):
+                verts = bodies.verts[row[0], people.few.kept].numpy()
+                assert np.array_equal(handle.vertices, verts)
     people.replace(None)
     assert people.bodies is None
+    assert drawn == {}

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from mover.app.pictures.film import pixels
 from mover.app.report.scene_view import Thinning, floor_of, thin, thin_choice
 from mover.app.viewer.session import Session
 from mover.core.colours import Colour, colour, person_colour
@@ -27,8 +28,6 @@ class DrawnPeople:
     server: Any
     bodies: Bodies | None = None
     frames: Sequence[int] = ()
-    rows: dict[tuple[int, int], int] = field(default_factory=dict[tuple[int, int], int])
-    """Row of each frame and person."""
     few: Thinning | None = None
     handles: dict[int, Any] = field(default_factory=dict[int, Any])
     visible: bool = True
@@ -39,15 +38,12 @@ class DrawnPeople:
         with self.lock:
             for handle in self.handles.values():
                 handle.remove()
-            self.handles, self.bodies, self.frames, self.rows = {}, None, (), {}
+            self.handles, self.bodies, self.frames = {}, None, ()
             if bodies is None or not len(bodies.verts):
                 return
-            pairs = zip(bodies.frame.tolist(), bodies.person.tolist(), strict=True)
-            self.rows = {pair: row for row, pair in enumerate(pairs)}
-            self.frames = bodies.frame.unique().tolist()
+            self.bodies, self.frames = bodies, bodies.frame.unique().tolist()
             middle = bodies.verts[len(bodies.verts) // 2]
             self.few = thin_choice(middle, bodies.faces, FACES_BODY)
-            self.bodies = bodies
 
     def show(self, moment: int) -> None:
         """Draw the bodies of a moment."""
@@ -55,12 +51,12 @@ class DrawnPeople:
             if self.bodies is None:
                 return
             frame = self.frames[min(max(moment, 0), len(self.frames) - 1)]
-            for person in self.bodies.person.unique().tolist():
-                row = self.rows.get((frame, person))
-                if row is not None:
-                    self._draw(self.bodies, person, row)
-                if person in self.handles:
-                    self.handles[person].visible = self.visible and row is not None
+            rows = (self.bodies.frame == frame).nonzero()[:, 0].tolist()
+            shown = {int(self.bodies.person[row]): row for row in rows}
+            for person, row in shown.items():
+                self._draw(self.bodies, person, row)
+            for person, handle in self.handles.items():
+                handle.visible = self.visible and person in shown
 
     def _draw(self, bodies: Bodies, person: int, row: int) -> None:
         assert self.few is not None
@@ -140,8 +136,7 @@ class RoomWindow:
         camera, picture = scene.camera, None
         if shown.image is not None:
             every = max(1, -(-shown.image.shape[1] // WIDEST))
-            small = (255 * shown.image[::every, ::every]).round().clamp(0, 255)
-            picture = small.to(torch.uint8).numpy()
+            picture = pixels(shown.image[::every, ::every])
         self.ground = self.server.scene.add_grid(
             "/ground", 40.0, 40.0, plane="xz", cell_size=0.5, section_size=1.0, plane_opacity=0.0,
             position=(0.0, floor_of(scene), 0.0), fade_distance=30.0,

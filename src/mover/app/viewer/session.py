@@ -59,7 +59,7 @@ class Session:
     """What the user sees and has changed; every change is saved at once."""
 
     shown: Shown
-    file: Path | None  #: where the edits are kept; None: nowhere
+    file: Path  #: where the edits are kept
     edits: tuple[editing.Edit, ...] = ()
     done: int = 0  #: number of edits that are part of `shown.result`
     selected: str | None = None
@@ -131,20 +131,19 @@ class Session:
             listener()
 
     def _save(self) -> None:
-        if self.file is not None:
-            editing.write_edits(self.edits, self.file)
+        editing.write_edits(self.edits, self.file)
         if self.object_named(self.selected) is None:
             self.selected = None
         self.changed()
 
 
-def start_session(shown: Shown, file: Path | None) -> Session:
+def start_session(shown: Shown, file: Path) -> Session:
     """A session that goes on with the edits in `file`.
 
     Raises:
         InputError: If the edits do not fit the result.
     """
-    edits = editing.read_edits(file) if file is not None and file.is_file() else ()
+    edits = editing.read_edits(file) if file.is_file() else ()
     session = Session(shown, file, edits, min(int(shown.log.get("edits", 0)), len(edits)))
     assert session.scene is not None  # edits that do not fit are refused here
     return session
