@@ -98,17 +98,19 @@ def run_here(folder: Path, workers: int = 2, retry: bool = False, **more: Any) -
 
 def test_each_way_to_fail_leaves_its_own_clear_record(tmp_path: Path):
     ways = {0: "refuse", 1: "crash", 2: "slow", 3: "killed", 4: "silent"}
-    fakes(tmp_path, 7, ways)
+    fakes(tmp_path, 8, ways)
     jobs = jobs_of(tmp_path)
     jobs[2] = dataclasses.replace(jobs[2], limit=0.5)
+    jobs[5] = dataclasses.replace(jobs[5], command=("/no/such/program",))
     found = [outcome.state for outcome in run_batch(jobs, tmp_path / "out", 2)]
-    assert found == ["failed"] * 5 + ["done"] * 2
+    assert found == ["failed"] * 6 + ["done"] * 2
     assert list(failures(tmp_path).values()) == [
         f"exit code 2: {REFUSED}",
         "exit code 86: about to die",
         "ran longer than its limit of 0.5 s",
         "ended by signal 11 (Segmentation fault): it said nothing",
         "ended well without scene.json and run.json: it said nothing",
+        "could not be started: [Errno 2] No such file or directory: '/no/such/program'",
     ]
     assert list(states(tmp_path).values()) == found
 
@@ -136,15 +138,6 @@ def test_other_settings_a_changed_capture_or_a_lost_file_are_work_to_do(tmp_path
     assert run_here(tmp_path, settings="other") == ["done", "kept"]
 
 
-BATCH = """
-import sys
-from pathlib import Path
-import test_batch
-folder = Path(sys.argv[1])
-test_batch.run_here(folder, 4, limit=4.0)
-"""
-
-
 def done(out: Path) -> set[str]:
     files = out.glob("capture_*/batch.json")
     return {file.parent.name for file in files if (file.parent / "scene.json").is_file()}
@@ -152,10 +145,9 @@ def done(out: Path) -> set[str]:
 
 def killed_batch(folder: Path) -> "subprocess.Popen[bytes]":
     paths = os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)])
-    return subprocess.Popen(
-        [sys.executable, "-c", BATCH, str(folder)], stderr=subprocess.DEVNULL,
-        env={**os.environ, "PYTHONPATH": paths},
-    )  # fmt: skip
+    code = f"from test_batch import *; run_here(Path({str(folder)!r}), 4, limit=4.0)"
+    env = {**os.environ, "PYTHONPATH": paths}
+    return subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL, env=env)
 
 
 @pytest.mark.slow
@@ -222,13 +214,6 @@ def test_an_interrupted_job_leaves_no_record(tmp_path: Path):
     assert earlier(job) is None
     assert failures(tmp_path) == {}
     assert states(tmp_path) == {"capture_00": "open"}
-
-
-def test_a_command_that_does_not_exist_is_a_failure_not_an_end(tmp_path: Path):
-    fakes(tmp_path, 2, {})
-    jobs = [dataclasses.replace(job, command=("/no/such/program",)) for job in jobs_of(tmp_path)]
-    found = run_batch(jobs, tmp_path / "out", 2)
-    assert [outcome.state for outcome in found] == ["failed", "failed"]
 
 
 def test_a_list_names_captures_relative_to_itself_with_remarks(tmp_path: Path):

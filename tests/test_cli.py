@@ -17,26 +17,6 @@ from mover.app.cli.run import parse_run
 from mover.pipeline.presets import PRESETS
 
 
-def test_help_names_every_command_and_imports_nothing_heavy():
-    code = (
-        "import sys; sys.argv = ['mover', '--help']; from mover.app.cli import main; main();"
-        "heavy = {'torch', 'numpy', 'tyro', 'scipy', 'trimesh'} & set(sys.modules);"
-        "assert not heavy, heavy"
-    )
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    for name in ("demo", "check", "run", "evaluate", "experiment", "export", "batch"):
-        assert f"  {name} " in found.stdout
-
-
-def test_a_broken_pipe_ends_a_command_without_a_trace():
-    code = "from mover.app.cli import main, say; import mover.app.cli as cli, sys;"
-    code += "cli.command_of = lambda _: lambda _: [say('line') for _ in range(100_000)];"
-    code += "sys.argv = ['mover', 'run']; main()"
-    words = f'{sys.executable} -c "{code}" | head -1'
-    found = subprocess.run(["bash", "-c", words], capture_output=True, text=True)
-    assert (found.stdout, found.stderr) == ("line\n", "")
-
-
 @pytest.mark.slow
 def test_ctrl_c_ends_a_run_at_once_and_the_same_command_goes_on(folder, tmp_path):
     command = [sys.executable, "-m", "mover", "run", str(folder), "--out", str(tmp_path / "out")]
@@ -66,6 +46,18 @@ def command_that(body: str) -> list[str]:
     return [sys.executable, "-c", code]
 
 
+def in_shell(body: str, more: str, **env: str) -> "subprocess.CompletedProcess[str]":
+    words = f"{shlex.join(command_that(body))} {more}"
+    return subprocess.run(
+        ["bash", "-c", words], capture_output=True, text=True, env={**os.environ, **env}
+    )
+
+
+def test_a_broken_pipe_ends_a_command_without_a_trace():
+    found = in_shell("[cli.say('line') for _ in range(100_000)]", "| head -1")
+    assert (found.stdout, found.stderr) == ("line\n", "")
+
+
 def test_ctrl_c_ends_a_run_whose_library_swallows_it():
     body = "\n    ".join([
         "print('ready', flush=True)", "for _ in range(2):", "    try:", "        time.sleep(30)",
@@ -89,9 +81,7 @@ def test_ctrl_c_ends_a_run_whose_library_swallows_it():
     ("cli.say('out'), cli.say('ü', sys.stderr)", "\\xfc\n", 0),
 ])  # fmt: skip
 def test_no_memory_a_closed_output_and_old_letters_are_no_traceback(body, said, code):
-    words = " ".join(map(shlex.quote, command_that(body))) + " >&-"
-    env = {**os.environ, "PYTHONIOENCODING": "ascii"}
-    found = subprocess.run(["bash", "-c", words], capture_output=True, text=True, env=env)
+    found = in_shell(body, ">&-", PYTHONIOENCODING="ascii")
     assert (found.stderr, found.returncode) == (said, code)
 
 
@@ -147,6 +137,12 @@ def check(folder):
     return cli.run_command("check", [str(folder), "--out", str(folder.parent / "check.png")])
 
 
+def one_line(capsys) -> str:
+    """What was said on stderr, in one line."""
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    return line
+
+
 def test_check_draws_a_picture_and_lists_every_object(folder, capsys):
     assert check(folder) == 0
     out = capsys.readouterr().out
@@ -167,8 +163,7 @@ def test_a_picture_that_cannot_be_written_is_refused_before_the_capture_is_read(
     tmp_path, name, capsys
 ):
     assert cli.run_command("check", [str(tmp_path), "--out", str(tmp_path / name)]) == 2
-    message = capsys.readouterr().err.strip()
-    assert len(message.splitlines()) == 1
+    message = one_line(capsys)
     assert "--out: " in message
     assert repr(name) in message
     assert ".png or .jpg or .jpeg" in message
@@ -178,9 +173,7 @@ def test_wrong_input_gives_one_sentence_that_names_file_and_field(folder, capsys
     camera = json.loads((folder / "camera.json").read_text())
     (folder / "camera.json").write_text(json.dumps(camera | {"fl_x": -1.0}))
     assert check(folder) == 2
-    message = capsys.readouterr().err.strip()
-    assert len(message.splitlines()) == 1
-    assert "fl_x" in message
+    assert "fl_x" in one_line(capsys)
 
 
 def test_a_file_as_the_folder_of_results_is_one_sentence(folder, tmp_path, capsys):
@@ -210,8 +203,13 @@ def test_a_full_disk_is_one_sentence_and_loses_nothing(folder, tmp_path, capsys,
 
 LIGHT = """
 import contextlib, io, sys
-from mover.app.cli import COMMANDS, run_command
-from mover.app.cli import main
+from mover.app.cli import COMMANDS, main, run_command
+
+sys.argv = ["mover", "--help"]
+with contextlib.redirect_stdout(io.StringIO()) as shown:
+    main()
+assert all(f"  {name} " in shown.getvalue() for name in COMMANDS)
+assert {"torch", "numpy", "tyro", "scipy", "trimesh"}.isdisjoint(sys.modules)
 
 def silent(call):
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
@@ -248,6 +246,5 @@ def test_commands_of_the_bench_say_where_it_is_if_it_is_not_installed(name, monk
 
     monkeypatch.setattr(cli.importlib, "import_module", absent)
     assert cli.run_command(name, []) == 2
-    said = capsys.readouterr().err
-    assert said.startswith(f"mover {name}: mover_bench is not in the wheel of mover; pip install")
-    assert said.count("\n") == 1
+    said = f"mover {name}: mover_bench is not in the wheel of mover; pip install"
+    assert one_line(capsys).startswith(said)

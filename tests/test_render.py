@@ -8,7 +8,9 @@ import pytest
 import torch
 from little_room import GROUND, room, walkers
 from PIL import Image
+from tiny_capture import HEIGHT, WIDTH, write_capture
 
+from mover.app.cli import run_command
 from mover.app.pictures import paint
 from mover.app.pictures.config import RenderConfig
 from mover.app.pictures.film import save_film, video_pictures
@@ -18,6 +20,8 @@ from mover.core.errors import InputError
 from mover.core.types import Segment
 from mover.geometry.camera import project, to_camera
 from mover.geometry.rle import thinned
+from mover.io.capture.bodies_file import write_bodies
+from mover.io.capture.scene_file import write_scene
 from mover_bench.rooms.render import see
 
 
@@ -71,10 +75,9 @@ def unannotated(scene):
     return dataclasses.replace(scene, objects=pieces)
 
 
-def folder(tmp_path: Path) -> Path:
-    from mover.io.capture.bodies_file import write_bodies
-    from mover.io.capture.scene_file import write_scene
-
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    """The folder of a result."""
     for name, shift in (("scene", 0.0), ("initial", 0.3)):
         write_scene(unannotated(room(shift)), tmp_path / f"{name}.json")
     for name in ("bodies", "initial_bodies"):
@@ -82,9 +85,9 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_film_has_a_picture_for_each_frame_at_the_size_asked_for(tmp_path: Path):
+def test_a_film_has_a_picture_for_each_frame_at_the_size_asked_for(out: Path):
     av = pytest.importorskip("av")
-    out, film = folder(tmp_path), tmp_path / "room.mp4"
+    film = out / "room.mp4"
     count = render_result(out, film, RenderConfig(width=161))
     with av.open(str(film)) as video:
         pictures = list(video.decode(video=0))
@@ -96,11 +99,10 @@ def test_a_film_has_a_picture_for_each_frame_at_the_size_asked_for(tmp_path: Pat
     assert np.abs(moved[0] - moved[1]).max() > 50
 
 
-def test_a_still_shows_the_frame_that_is_asked_for(tmp_path: Path):
-    out = folder(tmp_path)
+def test_a_still_shows_the_frame_that_is_asked_for(out: Path):
     found = []
     for frame in (0, 15):
-        path = tmp_path / f"{frame}.png"
+        path = out / f"{frame}.png"
         assert render_result(out, path, RenderConfig(width=160, frame=frame)) == 1
         with Image.open(path) as picture:
             found.append(np.asarray(picture).astype(float))
@@ -109,8 +111,6 @@ def test_a_still_shows_the_frame_that_is_asked_for(tmp_path: Path):
 
 
 def test_the_video_is_behind_the_furniture(tmp_path: Path):
-    from tiny_capture import HEIGHT, WIDTH, write_capture
-
     capture = write_capture(tmp_path / "capture")
     (capture / "frames").mkdir()
     colours = {0: (250, 0, 0), 3: (0, 250, 0)}
@@ -136,8 +136,6 @@ def test_frames_of_a_film_are_found_by_their_number(tmp_path: Path):
 
 @pytest.mark.parametrize("name", ["room.gif", "room", "room.mp4"])
 def test_what_cannot_be_drawn_is_said(tmp_path: Path, name: str):
-    from mover.io.capture.scene_file import write_scene
-
     pytest.importorskip("av")
     write_scene(unannotated(room()), tmp_path / "scene.json")
     with pytest.raises(InputError, match="--to: "):
@@ -147,9 +145,8 @@ def test_what_cannot_be_drawn_is_said(tmp_path: Path, name: str):
 def test_moved_furniture_is_drawn_where_it_stands_in_the_frame():
     scene = room()
     chair, *others = scene.objects
-    there = dataclasses.replace(
-        chair, t_world_object=chair.t_world_object + torch.tensor([-0.6, 0.0, 0.4])
-    )
+    shift = torch.tensor([-0.6, 0.0, 0.4])
+    there = dataclasses.replace(chair, t_world_object=chair.t_world_object + shift)
     stays = tuple(Segment(f, p.t_world_object, p.yaw) for f, p in ((0, chair), (5, there)))
     moved = dataclasses.replace(chair, segments=stays)
     world = dataclasses.replace(scene, objects=(moved, *others))
@@ -161,10 +158,8 @@ def test_moved_furniture_is_drawn_where_it_stands_in_the_frame():
     assert (found[0] - found[1]).abs().max() > 0.2
 
 
-def test_the_command_says_what_it_drew(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    from mover.app.cli import run_command
-
-    out, path = folder(tmp_path), tmp_path / "room.jpg"
+def test_the_command_says_what_it_drew(out: Path, capsys: pytest.CaptureFixture[str]):
+    path = out / "room.jpg"
     assert run_command("render", [str(out), "--to", str(path), "--width", "64"]) == 0
     assert "one picture" in capsys.readouterr().out
     with Image.open(path) as picture:
