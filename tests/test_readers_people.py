@@ -121,9 +121,14 @@ def known_of(tool: str, faces: Path, **more: Any) -> Known:
     return replace(KNOWN, **({"faces": faces} if tool == "sam3dbody" else {}), **more)
 
 
+def read(tool: str, source: Path, known: Known = KNOWN) -> Any:
+    """Bodies or keypoints of a fixture's tool."""
+    reader = keypoints_from if tool in made.KEYPOINTS else bodies_from
+    return reader(tool.split(":")[0], source, known)
+
+
 def imported(tool: str, folder: Path, faces: Path, **more: Any):
-    path = made.BODIES[tool](folder)
-    found = bodies_from(tool.split(":")[0], path, known_of(tool, faces, **more))
+    found = read(tool, made.BODIES[tool](folder), known_of(tool, faces, **more))
     if not tool.startswith("amass"):
         assert found.bodies.space == "camera"
         return found
@@ -240,7 +245,7 @@ def test_a_field_that_is_missing_or_has_a_wrong_shape_is_named(tool, tmp_path, f
                 dump(tree, path)
                 words = f"no key .*'{name}'" if value is ... else name
                 with pytest.raises(InputError, match=words):
-                    bodies_from(tool.split(":")[0], source, known)
+                    read(tool, source, known)
                 path.write_bytes(kept)
                 refused += 1
     assert refused >= 3
@@ -277,11 +282,9 @@ def test_a_file_with_one_wrong_field_is_read_or_refused(tool, tmp_path, faces):
         node[way[-1]] = changed(node[way[-1]], rng)
         dump(tree, path)
         try:
-            if tool in made.KEYPOINTS:
-                assert keypoints_from(tool.split(":")[0], source, known).points.isfinite().all()
-            else:
-                bodies = bodies_from(tool.split(":")[0], source, known).bodies
-                assert bodies.verts.isfinite().all()
+            found = read(tool, source, known)
+            points = found.points if tool in made.KEYPOINTS else found.bodies.verts
+            assert points.isfinite().all()
         except InputError as error:
             assert 20 < len(str(error)) < 600  # noqa: PT017
         path.write_bytes(kept)
@@ -365,7 +368,7 @@ def test_a_model_file_in_the_true_format_gives_meshes_and_keeps_flat_hands(tmp_p
 
 
 def smplify_file(folder: Path, **changed: Any) -> Path:
-    data = {**made.smplx_parts(0), "camera_translation": np.array([[0, 0, 3.0]]), **changed}
+    data = {**made.fit(0, np.array([0, 0, 3.0])), "camera_rotation": None, **changed}
     kept = {key: value for key, value in data.items() if value is not None}
     return made.store(kept, folder / "000.pkl")
 
@@ -449,15 +452,14 @@ def test_hostile_pickles_of_every_tool_are_refused_at_once_and_not_run(tool, tmp
     path = made.BODIES[tool](tmp_path)
     hostile = [(bomb(), ": (unfolds|holds a list)") for bomb in BOMBS.values()]
     hostile.append((Calls(os.system, "touch owned"), ""))
-    for file in [f for f in tmp_path.rglob("*") if f.is_file()]:
-        assert file.suffix in FILES
-        if file.suffix in (".npz", ".json"):
-            continue  # these hold no pickles
+    files = [f for f in tmp_path.rglob("*") if f.is_file()]
+    assert {f.suffix for f in files} <= set(FILES)
+    for file in [f for f in files if f.suffix not in (".npz", ".json")]:  # these hold no pickles
         kept = file.read_bytes()
         for value, words in hostile:
             dump({"pose": value}, file)
             with pytest.raises(InputError, match=file.name + words):
-                bodies_from(tool.split(":")[0], path, KNOWN)
+                read(tool, path)
         file.write_bytes(kept)
     assert not (tmp_path / "owned").exists()
 
@@ -500,7 +502,7 @@ def test_what_is_in_place_of_a_file_is_named_without_pythons_words(tool, what, t
         whole = file.read_bytes()
         file.write_bytes(whole[: len(whole) // 2] if content is None else content)
         with pytest.raises(InputError, match=rf"^{file.name}: .*{words}") as caught:
-            (keypoints_from if tool == "coco17" else bodies_from)(tool, source, KNOWN)
+            read(tool, source)
         assert not re.search(r"Error\b|opcode|zip file|KeyError|Memo", str(caught.value))
         file.write_bytes(whole)
 
@@ -526,16 +528,13 @@ def test_people_without_tracks_are_followed_by_position_not_by_rank(tool, tmp_pa
         order = places[:: -1 if frame % 2 else 1]
         if tool == "smplifyx":
             for k, place in enumerate(order):
-                folder = tmp_path / f"{frame:04d}"
-                folder.mkdir(exist_ok=True)
-                data = {**made.smplx_parts(0), "camera_translation": place}
-                made.store(data, folder / f"{k:03d}.pkl")
+                made.store(made.fit(0, place), tmp_path / f"{frame:04d}" / f"{k:03d}.pkl")
         else:
             given = made.pare_person()
             crop = np.array([[0.4, 0.7, place[0, 0] * 2, 0] for place in order])
             rows = {"pred_pose": given["pose"][[0, 0]], "pred_shape": given["betas"][[0, 0]]}
             made.dump({**rows, "orig_cam": crop}, tmp_path / f"img_{frame:06d}.pkl")
-    found = bodies_from(tool.split(":")[0], tmp_path, KNOWN)
+    found = read(tool, tmp_path)
     left = found.bodies.person[found.bodies.verts.mean(1)[:, 0] < 0.4]
     assert left.unique().tolist() == [0]
     assert sorted(found.bodies.person.tolist()) == [0] * 6 + [1] * 6
@@ -590,7 +589,7 @@ def test_pieces_of_whams_walker_are_one_person_and_the_user_can_join_more(tmp_pa
 
 @pytest.mark.parametrize("tool", made.KEYPOINTS)
 def test_keypoints_fall_on_the_joints_they_name_and_are_read_again(tool, tmp_path):
-    found = keypoints_from(tool.split(":")[0], made.KEYPOINTS[tool](tmp_path), Known(fps=30.0))
+    found = read(tool, made.KEYPOINTS[tool](tmp_path), Known(fps=30.0))
     assert found.frame.tolist() == made.FRAMES.tolist()
     assert len(found.person.unique()) == 1
     joints = LAYOUTS[found.layout]
