@@ -211,6 +211,18 @@ def test_a_gltf_cannot_bring_other_files_along(tmp_path):
         chosen("FORMAT", "glb", *IMPORTED)(path, Hints(work=tmp_path))
 
 
+@pytest.mark.parametrize("wrong", [{"yfov": 0}, {"aspectRatio": 0}, {"yfov": float("inf")}])
+def test_a_camera_of_a_gltf_without_an_angle_is_refused(tmp_path, wrong):
+    path = layouts.write_glb(tmp_path / "in" / "a.glb", little())
+
+    def change(tree):
+        tree["cameras"][0]["perspective"].update(wrong)
+
+    path.write_bytes(layouts.with_json(path.read_bytes(), change))
+    with pytest.raises(InputError, match="a camera that cannot be read"):
+        chosen("FORMAT", "glb", *IMPORTED)(path, Hints(work=tmp_path))
+
+
 def test_xml_bombs_are_refused(tmp_path):
     from mover.io.files.cameras import read_camera_file
 

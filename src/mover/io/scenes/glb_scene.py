@@ -135,7 +135,7 @@ def _view(path: Path, hints: Hints) -> tuple[dict[str, Any], Matrix] | None:
         fx = fy if ratio is None else w / 2 / (tangent * ratio)
         fields = {"w": w, "h": h, "fl_x": fx, "fl_y": fy, "cx": w / 2, "cy": h / 2}
         return fields, _pose_of(nodes, index)
-    except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError) as error:
         found = f"a camera that cannot be read ({reason(error)})"
         raise InputError(f"{path.name}: has {found}, expected a perspective camera") from error
 
