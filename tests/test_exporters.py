@@ -13,8 +13,7 @@ from furnished import along_the_axes as along_the_axes  # for every test
 from furnished import bodies_of, furnished, moved, moving_pose, similar, two_people, write_out
 from little_room import walkers
 from make_scenes import four
-from PIL import Image
-from test_export import Glb, bounds_of, placed, textured
+from test_export import Glb, bounds_of, placed
 
 import mover.io.export.usd
 from mover.app.cli import run_command
@@ -218,23 +217,6 @@ def test_no_frame_between_keys_is_farther_off_than_is_said_and_few_keys_are_few(
     few, off = keyframes(verts, time, 0.0, 7)
     assert len(few) == 7
     assert off > 0
-
-
-def test_usd_keeps_textures_and_names_that_it_does_not_allow(tmp_path):
-    Usd = pytest.importorskip("pxr.Usd", reason="needs usd-core")
-    textured(baseColorFactor=[51, 255, 102, 255]).export(tmp_path / "box.glb")
-    scene, names = furnished(("chair",)), ("0-chair.a", "0-chair_a")
-    chair = replace(scene.objects[0], mesh_file=str(tmp_path / "box.glb"))
-    scene = replace(scene, objects=tuple(replace(chair, id=name) for name in names))
-    home = Finished(tmp_path, scene, None, None)
-    stage = Usd.Stage.Open(str(export_usd(home, tmp_path / "usd").files[0]))
-    ids = {p.GetCustomDataByKey("mover:id") for p in stage.Traverse()} - {None}
-    assert ids == set(names)
-    picture, _ = (p for p in stage.Traverse() if p.GetName() == "picture")
-    scale = picture.GetAttribute("inputs:scale").Get()
-    assert list(scale) == pytest.approx([0.2, 1.0, 0.4, 1.0])  # glTF multiplies them, too
-    found = Image.open(tmp_path / "usd" / picture.GetAttribute("inputs:file").Get().path)
-    assert np.array_equal(np.asarray(found).ravel(), np.arange(48))
 
 
 @pytest.mark.parametrize("up", ["y", "z"])

@@ -11,6 +11,8 @@ import torch
 from furnished import along_the_axes as along_the_axes  # for every test
 from furnished import furnished, moved, two_people, write_out
 from little_room import GROUND
+from PIL import Image
+from test_export import textured
 
 from mover.core.run import Run
 from mover.core.types import Bodies, Scene
@@ -207,13 +209,19 @@ def test_the_camera_sees_the_same_pixels(out):
     assert [u, v] == pytest.approx(seen[:2] / seen[2], abs=0.01)
 
 
-def test_ids_that_the_file_keeps_for_itself_stay_apart(out):
-    scene = room()
-    names = ("ground", "physics", "wood")
-    pieces = [replace(p, id=n) for p, n in zip(scene.objects, names, strict=True)]
-    stage = opened(Finished(out, replace(scene, objects=tuple(pieces)), None, None))
-    ids = [p.GetCustomDataByKey("mover:id") for p in stage.Traverse()]
-    assert set(names) <= set(ids)
+def test_textures_stay_and_ids_that_the_file_does_not_allow_or_has_itself_stay_apart(out):
+    textured(baseColorFactor=[51, 255, 102, 255]).export(out / "box.glb")
+    scene, names = room(), ("ground", "physics", "wood", "0-chair.a", "0-chair_a")
+    chair = replace(scene.objects[0], mesh_file=str(out / "box.glb"))
+    scene = replace(scene, objects=tuple(replace(chair, id=name) for name in names))
+    stage = opened(Finished(out, scene, None, None))
+    ids = {p.GetCustomDataByKey("mover:id") for p in stage.Traverse()} - {None}
+    assert ids == set(names)
+    picture, *_ = (p for p in stage.Traverse() if p.GetName() == "picture")
+    scale = picture.GetAttribute("inputs:scale").Get()
+    assert list(scale) == pytest.approx([0.2, 1.0, 0.4, 1.0])  # glTF multiplies them, too
+    found = Image.open(out / "export" / picture.GetAttribute("inputs:file").Get().path)
+    assert np.array_equal(np.asarray(found).ravel(), np.arange(48))
 
 
 def test_an_object_that_is_moved_stands_still_until_it_stands_elsewhere(out):
