@@ -16,7 +16,7 @@ from mover.io.files.npz import read_npz, write_npz
 
 FORMAT, FILE = "mover-contact-labels", "contacts.npz"
 SURE = 0.5  # confidence from which `object_contact` says yes
-INDICES = dict.fromkeys(("frame", "person", "part", "object"), ())
+INDICES = ("frame", "person", "part", "object")
 REALS = {"position": (3,), "normal": (3,), "gap": (), "confidence": ()}
 
 
@@ -38,18 +38,16 @@ def read_labels(path: Path) -> ContactLabels:
     """
     if not path.is_file():
         raise InputError(f"{path}: not found; `mover run` writes it for results with people")
-    found, widths = read_npz(path).value, {**INDICES, **REALS}
-    missing = [n for n in (*widths, "parts", "objects") if n not in found]
+    at = read_npz(path)
+    found = at.value
+    missing = [n for n in (*INDICES, *REALS, "parts", "objects") if n not in found]
     if missing or str(found.get("format", "")) != FORMAT:
         lacks = f"lacks {', '.join(missing)}" if missing else "is of another format"
         raise InputError(f"{path.name}: {lacks}, expected the labels that `mover run` writes")
-    rows = len(found["frame"])
-    for name, width in widths.items():
-        if found[name].shape != (rows, *width):
-            expected = f"expected {(rows, *width)}"
-            raise InputError(f"{path.name}: '{name}' has shape {found[name].shape}, {expected}")
+    rows = len(at.get("frame").indices("rows"))
     return ContactLabels(
-        **{name: torch.from_numpy(found[name]) for name in widths},
+        **{name: torch.from_numpy(at.get(name).indices(rows)) for name in INDICES},
+        **{name: torch.from_numpy(at.get(name).array((rows, *n))) for name, n in REALS.items()},
         parts=tuple(found["parts"].tolist()),
         objects=tuple(found["objects"].tolist()),
     )
