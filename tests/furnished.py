@@ -5,11 +5,13 @@ import math
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from little_room import GROUND, camera
 
+import mover.io.export.solids
 from mover.bodies.skinning import open_body, zero_pose
-from mover.core.types import Bodies, BodyPose, Scene, SceneObject
+from mover.core.types import Bodies, BodyPose, Scene, SceneObject, Segment
 from mover.furniture.library import make_piece
 from mover.io.capture.bodies_file import write_bodies
 from mover.io.capture.scene_file import write_scene
@@ -19,6 +21,14 @@ SPOTS = {
     "shelf": (2.4, -4.4, -1.2), "floor lamp": (-2.6, -2.6, 0.0),
 }  # fmt: skip
 FPS = 10.0
+
+
+@pytest.fixture(scope="module", autouse=True)
+def along_the_axes():
+    """CoACD takes seconds where the cuts along the axes leave hollows: it has a test of its own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mover.io.export.solids, "find_spec", lambda _: None)
+        yield
 
 
 def furnished(
@@ -36,6 +46,15 @@ def furnished(
             SceneObject(key, name, mesh, "", None, "ground", t, torch.tensor(yaw), torch.ones(3))
         )
     return Scene(camera(), ground, tuple(pieces))
+
+
+def moved(scene: Scene, frame: int) -> Scene:
+    """The first object stands elsewhere and turned from a frame on."""
+    first, *others = scene.objects
+    there = first.t_world_object + torch.tensor([0.3, 0.0, 1.0])
+    stays = (Segment(0, first.t_world_object, first.yaw), Segment(frame, there, first.yaw + 1))
+    objects = (dataclasses.replace(first, segments=stays), *others)
+    return dataclasses.replace(scene, objects=objects)
 
 
 def moving_pose(frames: int, person: int = 0, pace: float = 1.0) -> BodyPose:

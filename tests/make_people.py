@@ -151,10 +151,11 @@ def matrices(vectors: np.ndarray) -> np.ndarray:
 
 
 def in_world(true: dict, R: np.ndarray, t: np.ndarray, model: str) -> tuple[np.ndarray, np.ndarray]:
-    """Root and transl in the world x_world = R x_cam + t: the root turns about the pelvis."""
-    root = (Rotation.from_matrix(R) * Rotation.from_rotvec(true["angles"][:, 0])).as_rotvec()
+    """Angles and transl in the world x_world = R x_cam + t: the root turns about the pelvis."""
+    angles = true["angles"].copy()
+    angles[:, 0] = (Rotation.from_matrix(R) * Rotation.from_rotvec(angles[:, 0])).as_rotvec()
     rest = skeleton(model)[0][0] * (1 + 0.03 * true["betas"][:, :1])
-    return root, (rest + true["transl"]) @ R.T + t - rest
+    return angles, (rest + true["transl"]) @ R.T + t - rest
 
 
 def upright() -> tuple[np.ndarray, np.ndarray]:
@@ -167,10 +168,10 @@ def write_gvhmr(folder: Path, names=("smpl_params_incam", "smpl_params_global"))
     true = person("smplx")
     used = lens(math.hypot(WIDTH, HEIGHT))
     shift = under(used, true)
-    root, place = in_world(true, *upright(), "smplx")
+    world, place = in_world(true, *upright(), "smplx")
     body = {"body_pose": true["angles"][:, 1:22].reshape(-1, 63), "betas": true["betas"]}
     incam = {**body, "global_orient": true["angles"][:, 0], "transl": true["transl"] + shift}
-    data = {names[0]: incam, names[1]: {**body, "global_orient": root, "transl": place}}
+    data = {names[0]: incam, names[1]: {**body, "global_orient": world[:, 0], "transl": place}}
     data["K_fullimg"] = np.broadcast_to(used, (len(FRAMES), 3, 3)).copy()
     torch.save(to_torch(data), folder / "hmr4d_results.pt")
     return folder / "hmr4d_results.pt"
@@ -195,9 +196,7 @@ def dump(value, path: Path, compress=0) -> Path:
 def wham_person() -> dict:
     true = person("smpl")
     shift = under(lens(math.hypot(WIDTH, HEIGHT)), true)
-    root, place = in_world(true, *upright(), "smpl")
-    world = true["angles"].copy()
-    world[:, 0] = root
+    world, place = in_world(true, *upright(), "smpl")
     return {
         "pose": true["angles"].reshape(-1, 72), "trans": true["transl"] + shift,
         "pose_world": world.reshape(-1, 72), "trans_world": place, "betas": true["betas"],
@@ -287,9 +286,7 @@ def write_prompthmr(folder: Path) -> Path:
     R, t = upright()
     count = int(FRAMES[-1]) + 1
     used = lens(1500.0)
-    root, place = in_world(true, R, t, "smplx")
-    world = true["angles"].copy()
-    world[:, 0] = root
+    world, place = in_world(true, R, t, "smplx")
     trans = true["transl"] + under(used, true)
     lens_keys = {"img_focal": 1500.0, "img_center": np.array([WIDTH / 2, HEIGHT / 2])}
     data = {
@@ -311,10 +308,10 @@ def write_slahmr(folder: Path) -> Path:
     true = person("smplh")
     R = Rotation.from_rotvec([0.2, -0.1, 0.05]).as_matrix()  # x_cam = R x_world + t
     t = np.array([0.1, -0.2, 0.3])
-    root, place = in_world(true, R.T, -R.T @ t, "smplh")
+    world, place = in_world(true, R.T, -R.T @ t, "smplh")
     count = int(FRAMES[-1]) + 1
     gaps = np.full((1, count, 63 + 6), np.nan)
-    gaps[0, FRAMES] = np.concatenate([root, place, true["angles"][:, 1:22].reshape(-1, 63)], 1)
+    gaps[0, FRAMES] = np.concatenate([world[:, 0], place, world[:, 1:22].reshape(-1, 63)], 1)
     betas = np.zeros((1, 16))
     betas[0, :10] = true["betas"][0]
     up = R.T @ camera_matrix()[:, 1]
@@ -353,9 +350,7 @@ def write_amass(folder: Path, model="smplh") -> Path:
     """A motion in a world with +z up: of SMPL-H as released first, of SMPL-X as `stageii`."""
     true = person(model)
     z_up = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    root, place = in_world(true, z_up @ camera_matrix().T, np.zeros(3), model)
-    angles = true["angles"].copy()
-    angles[:, 0] = root
+    angles, place = in_world(true, z_up @ camera_matrix().T, np.zeros(3), model)
     betas = np.zeros(16)
     betas[:10] = true["betas"][0]
     data = {"poses": angles.reshape(len(FRAMES), -1), "trans": place, "betas": betas}
@@ -372,15 +367,19 @@ def write_amass(folder: Path, model="smplh") -> Path:
 write_amass_x = partial(write_amass, model="smplx")
 
 
-def smplx_parts(k: int) -> dict:
+def fit(k: int, place: np.ndarray | None = None) -> dict:
+    """A frame's pickle of SMPLify-X, whose camera sees the body at a place, or of PROX (None)."""
     true = person("smplx")
     row = true["angles"][k]
+    prox = {"transl": true["transl"][k : k + 1], "pose_embedding": np.zeros((1, 32))}
     return {
         "betas": true["betas"][k : k + 1], "global_orient": row[:1],
         "body_pose": row[1:22].reshape(1, 63), "jaw_pose": row[22:23], "leye_pose": row[23:24],
         "reye_pose": row[24:25], "expression": np.zeros((1, 10)),
         "left_hand_pose": row[25:40].reshape(1, 45) - HAND_MEAN,
         "right_hand_pose": row[40:].reshape(1, 45) - HAND_MEAN,
+        "camera_rotation": np.eye(3)[None], **(prox if place is None else {}),
+        "camera_translation": np.zeros((1, 3)) if place is None else place.reshape(1, 3),
     }  # fmt: skip
 
 
@@ -388,20 +387,14 @@ def write_smplifyx(folder: Path) -> Path:
     true = person("smplx")
     place = true["transl"] + under(lens(5000.0), true)
     for k, frame in enumerate(FRAMES):
-        data = {**smplx_parts(k), "camera_rotation": np.eye(3)[None],
-                "camera_translation": place[k : k + 1]}  # fmt: skip
-        store(data, folder / "results" / f"{frame:06d}" / f"{TRACK:03d}.pkl")
+        store(fit(k, place[k]), folder / "results" / f"{frame:06d}" / f"{TRACK:03d}.pkl")
     return folder / "results"
 
 
 def write_prox(folder: Path) -> Path:
-    true = person("smplx")
     for k, frame in enumerate(FRAMES):
-        data = {**smplx_parts(k), "transl": true["transl"][k : k + 1],
-                "camera_rotation": np.eye(3)[None], "camera_translation": np.zeros((1, 3)),
-                "pose_embedding": np.zeros((1, 32))}  # fmt: skip
         name = f"s001_frame_{frame:05d}__00.00.0{k}.023"
-        store(data, folder / "results" / name / "000.pkl")
+        store(fit(k), folder / "results" / name / "000.pkl")
     return folder / "results"
 
 

@@ -6,7 +6,6 @@ origin, x_cam = R @ x_world (x right, y down, z forward).
 
 import io
 import json
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +20,8 @@ from tiny_capture import compressed, runs, write_obj
 
 NYU40 = {
     "bed": 4, "chair": 5, "sofa": 6, "table": 7, "desk": 14, "shelves": 15, "cabinet": 3,
-    "night_stand": 32, "lamp": 35, "bookshelf": 10, "otherfurniture": 39,
+    "night_stand": 32, "lamp": 35, "bookshelf": 10, "otherfurniture": 39, "wall": 1,
+    "television": 25,
 }  # fmt: skip
 FLIP = np.diag([1.0, -1.0, -1.0])
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # our world -> one with z up
@@ -108,9 +108,10 @@ def write_total3d(folder: Path, room: Room, *, flat: bool = False, kind: str = "
     (source / "detections.json").write_text(json.dumps(rows))
     # p_world = cam_R @ p_cam (forward, up, right); p_image = T p_cam; p_image = R p_ours.
     savemat(result / "r_ex.mat", {"cam_R": OURS_TO_T3D @ room.R.T @ T})
-    y = room.ground
-    signs = [[-1, 1, -1], [-1, 1, 1], [1, 1, 1], [1, 1, -1]]
-    corners = [[3 * a, 2.5, 3 * c] for a, _, c in signs] + [[3 * a, y, 3 * c] for a, _, c in signs]
+    # Four corners above, the same four below (yinyunie/Total3DUnderstanding, net_utils/libs.py:
+    # get_layout_bdb_sunrgbd), of a room that is turned as its own axes are.
+    flat = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]]) @ about_y(0.3)[::2, ::2].T * 3
+    corners = [[x, y, z] for y in (2.5, room.ground) for x, z in flat]
     savemat(result / "layout.mat", {"layout": np.array(corners, dtype="f4")})
     cells = np.empty((1, len(room.things)), dtype=object)
     for i, t in enumerate(room.things):
@@ -465,29 +466,6 @@ def write_labelme(path: Path, things: list[tuple[str, list[list[float]], str, in
     tree = {"version": "5.4.1", "flags": {}, "shapes": shapes, "imagePath": "a.jpg",
             "imageData": None, "imageHeight": 48, "imageWidth": 64}  # fmt: skip
     path.write_text(json.dumps(tree))
-    return path
-
-
-class Bomb:
-    """A pickle of this writes a file when it is loaded."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return exec, (f"open({str(self.path)!r}, 'w').write('run')",)
-
-
-def write_bomb(path: Path, mark: Path) -> Path:
-    """An .npz with a pickled object that would write `mark`."""
-    np.savez(path, masks=np.array([Bomb(mark)], dtype=object))
-    return path
-
-
-def write_zip_bomb(path: Path) -> Path:
-    """An .npz whose header promises 10^12 numbers."""
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("masks.npy", promise(10**6, 10**6) + b"\0" * 10**6)
     return path
 
 

@@ -145,7 +145,7 @@ def test_labels_come_back_from_their_file_and_a_wrong_one_is_refused(tmp_path):
     with np.load(out / "contacts.npz") as data:
         arrays = dict(data)
     for wrong, words in (
-        ({**arrays, "normal": arrays["normal"][:, :2]}, "'normal' has shape .* expected"),
+        ({**arrays, "normal": arrays["normal"][:, :2]}, "field 'normal' has shape .* expected"),
         ({"probability": np.zeros((2, 3))}, "lacks frame"),
     ):
         np.savez(out / "contacts.npz", **wrong)

@@ -2,7 +2,6 @@
 
 import json
 import math
-import struct
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,9 +32,25 @@ def placed(path: Path, name: str) -> trimesh.Trimesh:
     return trimesh.util.concatenate(parts)
 
 
-def tree_of(path: Path) -> dict[str, Any]:
-    raw = path.read_bytes()
-    return json.loads(raw[20 : 20 + struct.unpack("<I", raw[12:16])[0]])
+TYPES = {5126: np.float32, 5125: np.uint32, 5123: np.uint16, 5121: np.uint8}
+WIDTH = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+
+
+class Glb:
+    """The two parts of a glTF file, its tree and its block of bytes."""
+
+    def __init__(self, path: Path) -> None:
+        raw = path.read_bytes()
+        size = int.from_bytes(raw[12:16], "little")
+        self.tree, self.block = json.loads(raw[20 : 20 + size]), raw[28 + size :]
+
+    def array(self, index: int) -> np.ndarray:
+        accessor = self.tree["accessors"][index]
+        view = self.tree["bufferViews"][accessor["bufferView"]]
+        start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        kind, width = TYPES[accessor["componentType"]], WIDTH[accessor["type"]]
+        flat = np.frombuffer(self.block, kind, accessor["count"] * width, start)
+        return flat if width == 1 else flat.reshape(-1, width)
 
 
 def with_file(file: Path) -> Path:
@@ -66,7 +81,7 @@ def test_objects_are_nodes_of_their_ids_where_they_stand(tmp_path):
 def test_a_node_holds_the_placement_and_its_mesh_keeps_its_own_frame(tmp_path):
     turned = replace(room().objects[0], scale=torch.tensor([1.2, 0.8, 1.0]))
     path = write_glb(Scene(camera(), None, (turned,)), None, tmp_path / "scene.glb")
-    node = next(n for n in tree_of(path)["nodes"] if n.get("name") == "chair_0")
+    node = next(n for n in Glb(path).tree["nodes"] if n.get("name") == "chair_0")
     matrix = np.array(node["matrix"]).reshape(4, 4).T
     corner = np.array([0.25, 0.9, 0.25])
     c, s = math.cos(float(turned.yaw)), math.sin(float(turned.yaw))
@@ -98,7 +113,7 @@ def test_transforms_inside_the_users_file_apply(tmp_path):
 def test_at_most_twelve_bodies_are_named_after_person_and_frame(tmp_path):
     bodies = walkers(40, people=2)
     path = write_glb(room(), bodies, tmp_path / "scene.glb")
-    names = [n["name"] for n in tree_of(path)["nodes"] if n.get("name", "").startswith("body_")]
+    names = [n["name"] for n in Glb(path).tree["nodes"] if n.get("name", "").startswith("body_")]
     assert len(names) == 12
     for name in names:
         _, person, frame = name.split("_")
@@ -119,7 +134,7 @@ def test_the_floor_is_level_under_everything_and_faces_up(tmp_path):
 
 def test_the_camera_sees_the_same_pixels(tmp_path):
     scene = replace(room(), camera=camera(-0.3, 0.1))
-    tree = tree_of(write_glb(scene, None, tmp_path / "scene.glb"))
+    tree = Glb(write_glb(scene, None, tmp_path / "scene.glb")).tree
     lens = tree["cameras"][0]["perspective"]
     node = next(n for n in tree["nodes"] if "camera" in n)
     to_world = np.array(node["matrix"]).reshape(4, 4).T
@@ -136,7 +151,7 @@ def test_names_that_clash_stay_apart(tmp_path):
     names = ("ground", "camera", "world", "body_0_0", "ground_mesh")
     pieces = [piece(n, box(1, 1, 1), (i * 2.0, -3.0), 0.0, -1.5) for i, n in enumerate(names)]
     path = write_glb(Scene(camera(), -1.5, tuple(pieces)), walkers(1), tmp_path / "scene.glb")
-    tree = tree_of(path)
+    tree = Glb(path).tree
     assert len(tree["meshes"]) == len(names) + 2
     assert len({n["name"] for n in tree["nodes"]}) == len(tree["nodes"])
 
@@ -146,10 +161,6 @@ def test_normals_of_flattened_triangles_are_valid(tmp_path):
     shape = trimesh.Trimesh(corners, [[0, 1, 2], [3, 4, 5]], process=False)
     file = tmp_path / "flat.glb"
     file.write_bytes(trimesh.exchange.gltf.export_glb(trimesh.Scene(shape), include_normals=True))
-    path = with_file(file)
-    tree = tree_of(path)
-    accessor = tree["accessors"][tree["meshes"][0]["primitives"][0]["attributes"]["NORMAL"]]
-    view = tree["bufferViews"][accessor["bufferView"]]
-    start = len(path.read_bytes()) - tree["buffers"][0]["byteLength"] + view.get("byteOffset", 0)
-    normals = np.frombuffer(path.read_bytes(), np.float32, 18, start).reshape(6, 3)
+    glb = Glb(with_file(file))
+    normals = glb.array(glb.tree["meshes"][0]["primitives"][0]["attributes"]["NORMAL"])
     assert np.linalg.norm(normals, axis=1) == pytest.approx(np.ones(6), abs=1e-3)

@@ -1,8 +1,6 @@
 """Exports, read back by other programs or by a few naive lines: everything is where it was."""
 
-import json
 import math
-import struct
 from dataclasses import astuple, replace
 from pathlib import Path
 from typing import Any
@@ -11,18 +9,17 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from furnished import bodies_of, furnished, moving_pose, similar, two_people, write_out
+from furnished import along_the_axes as along_the_axes  # for every test
+from furnished import bodies_of, furnished, moved, moving_pose, similar, two_people, write_out
 from little_room import walkers
 from make_scenes import four
-from PIL import Image
-from test_export import bounds_of, textured
+from test_export import Glb, bounds_of, placed
 
-import mover.io.export.solids
 import mover.io.export.usd
 from mover.app.cli import run_command
 from mover.bodies.skinning import open_body
 from mover.core.errors import InputError
-from mover.core.types import Bodies, BodyPose, Scene, Segment
+from mover.core.types import Bodies, BodyPose, Scene
 from mover.geometry.placement import place_object, placed_at
 from mover.io.export.amass import export_amass
 from mover.io.export.finished import Finished, keyframes, read_finished
@@ -30,9 +27,6 @@ from mover.io.export.glb import export_glb
 from mover.io.export.scene_glb import export_ply, placement_of
 from mover.io.export.usd import export_usd
 from mover.io.formats import chosen
-
-TYPES = {5126: np.float32, 5125: np.uint32, 5123: np.uint16, 5121: np.uint8}
-WIDTH = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
 
 def scaled(scene: Scene) -> Scene:
@@ -44,24 +38,13 @@ def finished(tmp_path: Path, bodies: Bodies | None = None) -> Finished:
     return read_finished(write_out(tmp_path / "out", scaled(furnished()), bodies))
 
 
-class Glb:
+class Moving(Glb):
     """A naive reader of animated glTF: the formulas of its specification, one node at a time."""
 
     def __init__(self, path: Path) -> None:
-        raw = path.read_bytes()
-        size = struct.unpack("<I", raw[12:16])[0]
-        self.tree = json.loads(raw[20 : 20 + size])
-        self.block = raw[28 + size :]
+        super().__init__(path)
         nodes = enumerate(self.tree["nodes"])
         self.parent = {child: k for k, node in nodes for child in node.get("children", [])}
-
-    def array(self, index: int) -> np.ndarray:
-        accessor = self.tree["accessors"][index]
-        view = self.tree["bufferViews"][accessor["bufferView"]]
-        start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-        kind, width = TYPES[accessor["componentType"]], WIDTH[accessor["type"]]
-        flat = np.frombuffer(self.block, kind, accessor["count"] * width, start)
-        return flat if width == 1 else flat.reshape(-1, width)
 
     def named(self, name: str) -> int:
         return next(k for k, n in enumerate(self.tree["nodes"]) if n.get("name") == name)
@@ -143,14 +126,14 @@ def two(tmp_path_factory):
 @pytest.mark.parametrize("person", [0, 1])
 def test_bones_carry_the_skin_to_the_result_in_every_frame(two, person):
     bodies, found = two
-    glb, name = Glb(found.files[0]), f"person_{person}_body"
+    glb, name = Moving(found.files[0]), f"person_{person}_body"
     worst = max(miss(glb.skinned(name, t), bodies.verts[k]) for k, t in rows(bodies, person))
     assert worst < 0.006  # four weights a vertex, where the model has six
     assert f"{1e3 * worst:.0f} mm" in " ".join(found.notes) or person == 1
 
 
 def test_a_person_is_hidden_while_they_are_not_seen(two):
-    bodies, glb = two[0], Glb(two[1].files[0])
+    bodies, glb = two[0], Moving(two[1].files[0])
     seen = [t for _, t in rows(bodies, 1)]
     gap = int(np.argmax(np.diff(seen)))
     for time, size in ((0.0, 0.0), (seen[0], 1.0), (seen[gap], 1.0), (seen[gap] + 1.5, 0.0)):
@@ -161,7 +144,7 @@ def test_a_person_is_hidden_while_they_are_not_seen(two):
 
 def test_shapes_are_the_result_at_the_keys_and_near_it_between(tmp_path):
     bodies = bodies_of(moving_pose(30, pace=0.1))
-    glb = Glb(export_glb(finished(tmp_path, bodies), tmp_path, "morph").files[0])
+    glb = Moving(export_glb(finished(tmp_path, bodies), tmp_path, "morph").files[0])
     off = [miss(glb.morphed("person_0_body", t), bodies.verts[k]) for k, t in rows(bodies, 0)]
     keys = len(glb.tree["meshes"][-1]["primitives"][0]["targets"]) + 1
     assert sum(v < 1e-5 for v in off) >= keys
@@ -174,7 +157,7 @@ def test_bodies_without_parameters_still_move_and_have_no_bones_and_no_parameter
     home = finished(tmp_path, bodies)
     found = export_glb(home, tmp_path)
     k, t = rows(bodies, 1)[-1]
-    assert miss(Glb(found.files[0]).morphed("person_1_body", t), bodies.verts[k]) < 1e-5
+    assert miss(Moving(found.files[0]).morphed("person_1_body", t), bodies.verts[k]) < 1e-5
     assert "--capture" in " ".join(found.notes)
     with pytest.raises(InputError, match="--body skin"):
         export_glb(home, tmp_path, "skin")
@@ -187,7 +170,7 @@ def test_parameters_of_the_capture_move_bodies_that_were_turned_and_sized(tmp_pa
     grown = similar(truth, 1.03)
     result, given = replace(grown, space="world"), replace(truth, space="camera")
     home = Finished(write_out(tmp_path / "out", scene), scene, result, given)
-    glb = Glb(export_glb(home, tmp_path).files[0])
+    glb = Moving(export_glb(home, tmp_path).files[0])
     k, t = rows(result, 1)[3]
     assert miss(glb.skinned("person_1_body", t), result.verts[k]) < 0.006
     arrays = np.load(export_amass(home, tmp_path).files[1])
@@ -196,22 +179,16 @@ def test_parameters_of_the_capture_move_bodies_that_were_turned_and_sized(tmp_pa
 
 def test_trimesh_opens_the_file_with_the_objects_in_place(tmp_path):
     home = finished(tmp_path, two_people(4))
-    scene = trimesh.load_scene(export_glb(home, tmp_path).files[0])
+    (file,) = export_glb(home, tmp_path).files
     for piece in home.scene.objects:
-        node = next(n for n in scene.graph.nodes_geometry if n.startswith(f"{piece.id}_mesh"))
-        transform, name = scene.graph[node]
-        part = scene.geometry[name].copy().apply_transform(transform)
-        assert part.bounds == pytest.approx(bounds_of(piece), abs=1e-5)
+        assert placed(file, piece.id).bounds == pytest.approx(bounds_of(piece), abs=1e-5)
 
 
 @pytest.mark.parametrize("people", [False, True])
 def test_an_object_that_is_moved_jumps_to_its_next_place(tmp_path, people):
     home = finished(tmp_path, two_people(4) if people else None)
-    piece, *others = home.scene.objects
-    later = Segment(8, piece.t_world_object + torch.tensor([0.0, 0.0, 1.0]), piece.yaw + 1)
-    moved = replace(piece, segments=(Segment(0, piece.t_world_object, piece.yaw), later))
-    scene = replace(home.scene, objects=(moved, *others))
-    glb = Glb(export_glb(replace(home, scene=scene), tmp_path).files[0])
+    scene = moved(home.scene, 8)
+    glb = Moving(export_glb(replace(home, scene=scene), tmp_path).files[0])
     first, step = 0, 0.2
     if home.bodies is not None and home.bodies.fps is not None:
         first, step = int(home.bodies.frame.min()), 1 / home.bodies.fps
@@ -240,29 +217,6 @@ def test_no_frame_between_keys_is_farther_off_than_is_said_and_few_keys_are_few(
     few, off = keyframes(verts, time, 0.0, 7)
     assert len(few) == 7
     assert off > 0
-
-
-@pytest.fixture(autouse=True)
-def along_the_axes(monkeypatch):
-    """CoACD takes seconds for parts that no test looks at."""
-    monkeypatch.setattr(mover.io.export.solids, "find_spec", lambda _: None)
-
-
-def test_usd_keeps_textures_and_names_that_it_does_not_allow(tmp_path):
-    Usd = pytest.importorskip("pxr.Usd", reason="needs usd-core")
-    textured(baseColorFactor=[51, 255, 102, 255]).export(tmp_path / "box.glb")
-    scene, names = furnished(("chair",)), ("0-chair.a", "0-chair_a")
-    chair = replace(scene.objects[0], mesh_file=str(tmp_path / "box.glb"))
-    scene = replace(scene, objects=tuple(replace(chair, id=name) for name in names))
-    home = Finished(tmp_path, scene, None, None)
-    stage = Usd.Stage.Open(str(export_usd(home, tmp_path / "usd").files[0]))
-    ids = {p.GetCustomDataByKey("mover:id") for p in stage.Traverse()} - {None}
-    assert ids == set(names)
-    picture, _ = (p for p in stage.Traverse() if p.GetName() == "picture")
-    scale = picture.GetAttribute("inputs:scale").Get()
-    assert list(scale) == pytest.approx([0.2, 1.0, 0.4, 1.0])  # glTF multiplies them, too
-    found = Image.open(tmp_path / "usd" / picture.GetAttribute("inputs:file").Get().path)
-    assert np.array_equal(np.asarray(found).ravel(), np.arange(48))
 
 
 @pytest.mark.parametrize("up", ["y", "z"])
@@ -327,7 +281,7 @@ def test_angles_turn_back(tmp_path):
     pose = moving_pose(40)
     spin = torch.linspace(0, 4 * math.pi, 40)
     pose = replace(pose, global_orient=torch.stack([0 * spin, spin, 0 * spin], -1))
-    glb = Glb(export_glb(finished(tmp_path, bodies_of(pose)), tmp_path).files[0])
+    glb = Moving(export_glb(finished(tmp_path, bodies_of(pose)), tmp_path).files[0])
     animation = glb.tree["animations"][0]
     for channel in animation["channels"]:
         if channel["target"]["path"] == "rotation":

@@ -3,6 +3,7 @@
 import json
 import shutil
 import tempfile
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import tiny_capture as tiny
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from kept_mats import mats_read_once as mats_read_once  # for every test
+from test_safe_pickle import Calls
 
 from mover.core.errors import InputError
 from mover.io.capture.merge import import_into
@@ -149,8 +151,9 @@ def test_no_junk_in_any_json_field_raises_anything_else(sources, format, which, 
 
 
 def test_pickles_in_arrays_do_not_run(tmp_path):
-    mark = tmp_path / "mark"
-    bomb = layouts.write_bomb(tmp_path / "a.npz", mark)
+    mark, bomb = tmp_path / "mark", tmp_path / "a.npz"
+    writes = Calls(exec, f"open({str(mark)!r}, 'w').write('run')")
+    np.savez(bomb, masks=np.array([writes], dtype=object))
     with pytest.raises(InputError, match="pickled"):
         read_instances(bomb, {}, None)
     folder = layouts.write_sam3d(tmp_path / "sam", little())
@@ -160,8 +163,10 @@ def test_pickles_in_arrays_do_not_run(tmp_path):
 
 
 def test_zip_bombs_are_not_unpacked(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("masks.npy", layouts.promise(10**6, 10**6) + b"\0" * 10**6)
     with pytest.raises(InputError, match="bytes"):
-        read_instances(layouts.write_zip_bomb(tmp_path / "a.npz"), {}, None)
+        read_instances(tmp_path / "a.npz", {}, None)
     (tmp_path / "b.npy").write_bytes(layouts.promise(10**9, 3) + b"\0" * 100)
     with pytest.raises(InputError, match=r"b\.npy"):
         read_instances(tmp_path / "b.npy", {}, None)
@@ -203,6 +208,18 @@ def test_a_gltf_cannot_bring_other_files_along(tmp_path):
     images = {"images": [{"uri": "../secret.png"}]}
     path.write_bytes(layouts.with_json(path.read_bytes(), lambda tree: tree.update(images)))
     with pytest.raises(InputError, match="images beside it"):
+        chosen("FORMAT", "glb", *IMPORTED)(path, Hints(work=tmp_path))
+
+
+@pytest.mark.parametrize("wrong", [{"yfov": 0}, {"aspectRatio": 0}, {"yfov": float("inf")}])
+def test_a_camera_of_a_gltf_without_an_angle_is_refused(tmp_path, wrong):
+    path = layouts.write_glb(tmp_path / "in" / "a.glb", little())
+
+    def change(tree):
+        tree["cameras"][0]["perspective"].update(wrong)
+
+    path.write_bytes(layouts.with_json(path.read_bytes(), change))
+    with pytest.raises(InputError, match="a camera that cannot be read"):
         chosen("FORMAT", "glb", *IMPORTED)(path, Hints(work=tmp_path))
 
 

@@ -32,14 +32,10 @@ SHIFT = np.array([1.0, 2.0, 1.5])
 
 def write_fits(root: Path, recording: str, frames: int, kinds: tuple[str, ...]) -> None:
     """PROX's results/<frame>/000.pkl of every frame, of the true people under an identity."""
-    true = made.person("smplx")
     for kind in kinds:
         for k in range(frames):
-            data = {**made.smplx_parts(k), "transl": true["transl"][k : k + 1],
-                    "camera_rotation": np.eye(3)[None], "camera_translation": np.zeros((1, 3)),
-                    "pose_embedding": np.zeros((1, 32)), "gender": "male"}  # fmt: skip
-            name = layouts.prox_stem(recording, k)
-            made.store(data, root / kind / recording / "results" / name / "000.pkl")
+            file = root / kind / recording / "results" / layouts.prox_stem(recording, k) / "000.pkl"
+            made.store({**made.fit(k), "gender": "male"}, file)
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ import pickle
 import re
 import types
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -81,14 +82,11 @@ class Toy:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        return tuple(JOINTS[k] if k < 22 else f"part{k}" for k in range(self.count))
-
-    @property
-    def count(self) -> int:
-        return made.COUNTS[self.name][0]
+        count, _ = made.COUNTS[self.name]
+        return tuple(JOINTS[k] if k < 22 else f"part{k}" for k in range(count))
 
     def posed(self, pose: BodyPose) -> tuple[torch.Tensor, torch.Tensor]:
-        angles = np.zeros((len(pose.transl), self.count, 3))
+        angles = np.zeros((len(pose.transl), made.COUNTS[self.name][0], 3))
         body = pose.body_pose.shape[1] // 3
         angles[:, 0] = pose.global_orient
         angles[:, 1 : 1 + body] = pose.body_pose.reshape(-1, body, 3)
@@ -121,9 +119,14 @@ def known_of(tool: str, faces: Path, **more: Any) -> Known:
     return replace(KNOWN, **({"faces": faces} if tool == "sam3dbody" else {}), **more)
 
 
+def read(tool: str, source: Path, known: Known = KNOWN) -> Any:
+    """Bodies or keypoints of a fixture's tool."""
+    reader = keypoints_from if tool in made.KEYPOINTS else bodies_from
+    return reader(tool.split(":")[0], source, known)
+
+
 def imported(tool: str, folder: Path, faces: Path, **more: Any):
-    path = made.BODIES[tool](folder)
-    found = bodies_from(tool.split(":")[0], path, known_of(tool, faces, **more))
+    found = read(tool, made.BODIES[tool](folder), known_of(tool, faces, **more))
     if not tool.startswith("amass"):
         assert found.bodies.space == "camera"
         return found
@@ -240,7 +243,7 @@ def test_a_field_that_is_missing_or_has_a_wrong_shape_is_named(tool, tmp_path, f
                 dump(tree, path)
                 words = f"no key .*'{name}'" if value is ... else name
                 with pytest.raises(InputError, match=words):
-                    bodies_from(tool.split(":")[0], source, known)
+                    read(tool, source, known)
                 path.write_bytes(kept)
                 refused += 1
     assert refused >= 3
@@ -277,11 +280,9 @@ def test_a_file_with_one_wrong_field_is_read_or_refused(tool, tmp_path, faces):
         node[way[-1]] = changed(node[way[-1]], rng)
         dump(tree, path)
         try:
-            if tool in made.KEYPOINTS:
-                assert keypoints_from(tool.split(":")[0], source, known).points.isfinite().all()
-            else:
-                bodies = bodies_from(tool.split(":")[0], source, known).bodies
-                assert bodies.verts.isfinite().all()
+            found = read(tool, source, known)
+            points = found.points if tool in made.KEYPOINTS else found.bodies.verts
+            assert points.isfinite().all()
         except InputError as error:
             assert 20 < len(str(error)) < 600  # noqa: PT017
         path.write_bytes(kept)
@@ -322,9 +323,9 @@ def test_the_lens_follows_from_joints_where_the_focal_length_is_missing(tmp_path
 def test_a_moving_camera_is_named(tmp_path):
     """By its path where the tool knows it, else by its gravity."""
     folder = made.write_tram(tmp_path)
-    camera = np.load(folder / "camera.npy", allow_pickle=True).item()
+    camera = load(folder / "camera.npy")
     camera["world_cam_T"] = camera["world_cam_T"] + np.linspace(0, 1, 7)[:, None]
-    np.save(folder / "camera.npy", camera, allow_pickle=True)
+    dump(camera, folder / "camera.npy")
     (warning,) = bodies_from("tram", folder, KNOWN).warnings
     assert "turns by up to 0.0 degrees and travels 1.73 m" in warning
     data = made.wham_person()
@@ -365,7 +366,7 @@ def test_a_model_file_in_the_true_format_gives_meshes_and_keeps_flat_hands(tmp_p
 
 
 def smplify_file(folder: Path, **changed: Any) -> Path:
-    data = {**made.smplx_parts(0), "camera_translation": np.array([[0, 0, 3.0]]), **changed}
+    data = {**made.fit(0, np.array([0, 0, 3.0])), "camera_rotation": None, **changed}
     kept = {key: value for key, value in data.items() if value is not None}
     return made.store(kept, folder / "000.pkl")
 
@@ -376,8 +377,8 @@ def wham_file(folder: Path, **changed: Any) -> Path:
 
 def tram_without_rotations(folder: Path) -> Path:
     track = made.write_tram(folder) / "hps" / "hps_track_0.npy"
-    data = np.load(track, allow_pickle=True).item()
-    np.save(track, {**data, "pred_rotmat": data["pred_rotmat"] * 1.2}, allow_pickle=True)
+    data = load(track)
+    dump({**data, "pred_rotmat": data["pred_rotmat"] * 1.2}, track)
     return folder
 
 
@@ -386,39 +387,43 @@ def of_objects(folder: Path) -> Path:
     return folder
 
 
+def prior(folder: Path) -> Path:
+    np.savez(folder / "clip_000400_prior_results.npz", latent_pose=np.zeros((1, 5, 32)))
+    return folder / "clip_000400_prior_results.npz"
+
+
 def strange(folder: Path) -> Path:
     return made.store({"one": {"strange": np.zeros(3)}}, folder / "some.pkl")
 
 
 TWICE, NAN = np.array([0, 1, 1, 2, 3]), np.full((1, 3), np.nan)
-REFUSED = {
-    "a missing key": ("smplifyx", lambda folder: smplify_file(folder, body_pose=None), KNOWN,
+REFUSED: dict[str, tuple[Any, ...]] = {
+    "a missing key": ("smplifyx", partial(smplify_file, body_pose=None),
                       r"000\.pkl.*'body_pose'.*found 'betas', 'global_orient'"),
-    "a code of VPoser": ("smplifyx", lambda f: smplify_file(f, body_pose=np.zeros((1, 32))), KNOWN,
+    "a code of VPoser": ("smplifyx", partial(smplify_file, body_pose=np.zeros((1, 32))),
                          r"32 numbers, expected 63 angles: .*VPoser"),
-    "only NaN": ("smplifyx", lambda folder: smplify_file(folder, global_orient=NAN), KNOWN,
-                 "only rows with NaN"),
-    "a gender": ("smplifyx", lambda folder: smplify_file(folder, gender="some"), KNOWN,
+    "only NaN": ("smplifyx", partial(smplify_file, global_orient=NAN), "only rows with NaN"),
+    "a gender": ("smplifyx", partial(smplify_file, gender="some"),
                  "gender.*one of neutral, female, male"),
-    "a person twice": ("wham", lambda folder: wham_file(folder, frame_ids=TWICE), KNOWN,
-                       "person 7 twice in frame 1"),
-    "a negative frame": ("wham", lambda f: wham_file(f, frame_ids=TWICE - 1), KNOWN,
+    "a person twice": ("wham", partial(wham_file, frame_ids=TWICE), "person 7 twice in frame 1"),
+    "a negative frame": ("wham", partial(wham_file, frame_ids=TWICE - 1),
                          "frames are numbered from -1"),
-    "no rotations": ("tram", tram_without_rotations, KNOWN, "expected rotation matrices"),
-    "objects in an npz": ("slahmr", of_objects, KNOWN, r"'trans' .*no pickled objects"),
-    "no triangles": ("sam3dbody", made.write_sam3dbody, KNOWN, "--faces"),
-    "no lens": ("pare", made.write_pare, Known(), "--camera"),
-    "an unknown tool": ("hmr", lambda folder: folder, KNOWN, "gvhmr"),
-    **{f"a file for {tool}": (tool, strange, KNOWN, r"some\.pkl.*no key.*found '(one|strange)'")
+    "no rotations": ("tram", tram_without_rotations, "expected rotation matrices"),
+    "objects in an npz": ("slahmr", of_objects, r"'trans' .*no pickled objects"),
+    "the prior's file": ("slahmr", prior, r"motion prior.*expected .*_world_results\.npz"),
+    "no triangles": ("sam3dbody", made.write_sam3dbody, "--faces"),
+    "no lens": ("pare", made.write_pare, "--camera", Known()),
+    "an unknown tool": ("hmr", lambda folder: folder, "gvhmr"),
+    **{f"a file for {tool}": (tool, strange, r"some\.pkl.*no key.*found '(one|strange)'")
        for tool in ("gvhmr", "slahmr", "wham", "phalp", "prompthmr", "sam3dbody", "pare")},
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("case", REFUSED)
 def test_what_is_wrong_is_refused_by_name(case, tmp_path):
-    tool, write, known, words = REFUSED[case]
+    tool, write, words, *known = REFUSED[case]
     with pytest.raises(InputError, match=words):
-        bodies_from(tool, write(tmp_path), known)
+        read(tool, write(tmp_path), *known)
 
 
 def test_one_frame_is_enough_and_codes_of_vposer_are_decoded_with_its_weights(tmp_path):
@@ -449,15 +454,14 @@ def test_hostile_pickles_of_every_tool_are_refused_at_once_and_not_run(tool, tmp
     path = made.BODIES[tool](tmp_path)
     hostile = [(bomb(), ": (unfolds|holds a list)") for bomb in BOMBS.values()]
     hostile.append((Calls(os.system, "touch owned"), ""))
-    for file in [f for f in tmp_path.rglob("*") if f.is_file()]:
-        assert file.suffix in FILES
-        if file.suffix in (".npz", ".json"):
-            continue  # these hold no pickles
+    files = [f for f in tmp_path.rglob("*") if f.is_file()]
+    assert {f.suffix for f in files} <= set(FILES)
+    for file in [f for f in files if f.suffix not in (".npz", ".json")]:  # these hold no pickles
         kept = file.read_bytes()
         for value, words in hostile:
             dump({"pose": value}, file)
             with pytest.raises(InputError, match=file.name + words):
-                bodies_from(tool.split(":")[0], path, KNOWN)
+                read(tool, path)
         file.write_bytes(kept)
     assert not (tmp_path / "owned").exists()
 
@@ -500,15 +504,9 @@ def test_what_is_in_place_of_a_file_is_named_without_pythons_words(tool, what, t
         whole = file.read_bytes()
         file.write_bytes(whole[: len(whole) // 2] if content is None else content)
         with pytest.raises(InputError, match=rf"^{file.name}: .*{words}") as caught:
-            (keypoints_from if tool == "coco17" else bodies_from)(tool, source, KNOWN)
+            read(tool, source)
         assert not re.search(r"Error\b|opcode|zip file|KeyError|Memo", str(caught.value))
         file.write_bytes(whole)
-
-
-def test_the_priors_file_of_slahmr_is_named(tmp_path):
-    np.savez(tmp_path / "clip_000400_prior_results.npz", latent_pose=np.zeros((1, 5, 32)))
-    with pytest.raises(InputError, match=r"motion prior.*expected .*_world_results\.npz"):
-        bodies_from("slahmr", tmp_path / "clip_000400_prior_results.npz")
 
 
 def test_a_folder_without_a_name_is_called_by_its_own(tmp_path, monkeypatch):
@@ -526,16 +524,13 @@ def test_people_without_tracks_are_followed_by_position_not_by_rank(tool, tmp_pa
         order = places[:: -1 if frame % 2 else 1]
         if tool == "smplifyx":
             for k, place in enumerate(order):
-                folder = tmp_path / f"{frame:04d}"
-                folder.mkdir(exist_ok=True)
-                data = {**made.smplx_parts(0), "camera_translation": place}
-                made.store(data, folder / f"{k:03d}.pkl")
+                made.store(made.fit(0, place), tmp_path / f"{frame:04d}" / f"{k:03d}.pkl")
         else:
             given = made.pare_person()
             crop = np.array([[0.4, 0.7, place[0, 0] * 2, 0] for place in order])
             rows = {"pred_pose": given["pose"][[0, 0]], "pred_shape": given["betas"][[0, 0]]}
             made.dump({**rows, "orig_cam": crop}, tmp_path / f"img_{frame:06d}.pkl")
-    found = bodies_from(tool.split(":")[0], tmp_path, KNOWN)
+    found = read(tool, tmp_path)
     left = found.bodies.person[found.bodies.verts.mean(1)[:, 0] < 0.4]
     assert left.unique().tolist() == [0]
     assert sorted(found.bodies.person.tolist()) == [0] * 6 + [1] * 6
@@ -590,7 +585,7 @@ def test_pieces_of_whams_walker_are_one_person_and_the_user_can_join_more(tmp_pa
 
 @pytest.mark.parametrize("tool", made.KEYPOINTS)
 def test_keypoints_fall_on_the_joints_they_name_and_are_read_again(tool, tmp_path):
-    found = keypoints_from(tool.split(":")[0], made.KEYPOINTS[tool](tmp_path), Known(fps=30.0))
+    found = read(tool, made.KEYPOINTS[tool](tmp_path), Known(fps=30.0))
     assert found.frame.tolist() == made.FRAMES.tolist()
     assert len(found.person.unique()) == 1
     joints = LAYOUTS[found.layout]

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from furnished import furnished, write_out
+from furnished import along_the_axes as along_the_axes  # for every test
+from furnished import furnished, moved, write_out
 from little_room import GROUND, box, camera, mesh_of, piece
 
 import mover.evaluate.stability
-import mover.io.export.solids
 from mover.app.cli import run_command
 from mover.core.errors import InputError
 from mover.core.run import Run
-from mover.core.types import Mesh, Scene, Segment
+from mover.core.types import Mesh, Scene
 from mover.evaluate.stability import Settled, settle
 from mover.furniture.library import PIECES, canonical, make_piece
 from mover.geometry.placement import place_object, placed_at
@@ -34,12 +34,6 @@ BOXES = ("chair", "table")
 needs_mujoco = pytest.mark.skipif(
     not mover.evaluate.stability.find_spec("mujoco"), reason="needs the extra physics"
 )
-
-
-@pytest.fixture(autouse=True)
-def along_the_axes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """CoACD takes seconds where the cuts along the axes leave hollows: it has a test of its own."""
-    monkeypatch.setattr(mover.io.export.solids, "find_spec", lambda _: None)
 
 
 def manifold(mesh: Mesh) -> Any:
@@ -175,10 +169,7 @@ def test_keyframes_put_furniture_where_it_then_stands(tmp_path: Path):
     import mujoco
 
     home = read_finished(write_out(tmp_path / "out", furnished(BOXES)))
-    chair, table = home.scene.objects
-    later = Segment(8, chair.t_world_object + torch.tensor([0.3, 0.0, 1.0]), chair.yaw + 1)
-    stays = (Segment(0, chair.t_world_object, chair.yaw), later)
-    objects = (table, dataclasses.replace(chair, segments=stays))
+    objects = moved(home.scene, 8).objects[::-1]
     scene = dataclasses.replace(home.scene, objects=objects)
     file = export_mjcf(dataclasses.replace(home, scene=scene), tmp_path).files[0]
     model = mujoco.MjModel.from_xml_path(str(file))

@@ -1,15 +1,13 @@
-import json
 import math
 from pathlib import Path
-from typing import Any
 
+import make_scenes as layouts
 import numpy as np
 import pytest
 import tiny_capture as tiny
 import torch
 from kept_mats import mats_read_once as mats_read_once  # for every test
-from PIL import Image
-from scipy.io import savemat
+from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
 
 from mover.core.errors import InputError
@@ -22,79 +20,40 @@ from mover.io.formats import read
 DATA = Path(__file__).parents[2] / "shared" / "data" / "total3d_1"
 PITCH, ROLL = -0.25, 0.06
 K = np.array([[50.0, 0, 31], [0, 50, 22], [0, 0, 1]])
-# Class, angle of the front about +y, centre and half sizes in Total3D's world (forward, up, right).
-BOXES: list[tuple[Any, ...]] = [
-    (5, 0.4, [3.0, -0.9, 0.5], [0.3, 0.5, 0.2]),
-    (1, 0.0, [6.0, 0.0, 0.0], [3.0, 2.0, 0.1]),
-    (25, 2.0, [4.0, -0.1, -1.0], [0.4, 0.3, 0.1]),
-]
-
-
-def attitude() -> np.ndarray:
-    """cam_R = R_y(0) R_z(pitch) R_x(roll)."""
-    return Rotation.from_euler("ZX", [PITCH, ROLL]).as_matrix()
-
-
-def axes(angle: float) -> np.ndarray:
-    """The box's own axes as rows."""
-    return Rotation.from_euler("Y", angle).as_matrix().T
-
-
-def cell(angle: float, centre: list[float], half: list[float]) -> dict[str, Any]:
-    size, middle = np.array([half], "f4"), np.array([centre], "f4")
-    return {"basis": axes(angle).astype("f4"), "coeffs": size, "centroid": middle}
-
-
-LAYOUT = (0.3, [2.5, 0.525, -0.4], [3.5, 1.975, 2.2])
-
-
-def layout_box() -> np.ndarray:
-    """Corners as Total3D's `get_layout_bdb_sunrgbd` orders them: four above, the same four below.
-
-    Rows of the basis are the room's own axes (yinyunie/Total3DUnderstanding, net_utils/libs.py).
-    """
-    angle, centre, half = LAYOUT
-    basis = axes(angle) * np.array(half)[:, None]
-    around = [(-1, -1), (-1, 1), (1, 1), (1, -1)]
-    signs = np.array([[a, up, b] for up in (1, -1) for a, b in around], float)
-    return (signs @ basis + centre).astype("f4")
+# A vertex that no face uses counts in the bounds that are stretched to the box.
+VERTS = np.concatenate([tiny.STEP, [[0.0, -0.5, 0.0]]])
+THINGS = [
+    layouts.Thing(name, name, VERTS, np.concatenate([tiny.STEP_FACES, [[1, 1, 1]]]),
+                  np.array(place), yaw, np.array(scale))
+    for name, place, yaw, scale in (
+        ("chair", [0.5, -1.4, -3.0], 0.4, [0.6, 1.0, 0.4]),
+        ("wall", [0.0, -1.5, -6.0], 0.0, [6.0, 4.0, 0.2]),
+        ("television", [-1.0, 0.1, -4.0], 2.0, [0.8, 0.6, 0.2]),
+    )
+]  # fmt: skip
 
 
 def write(folder: Path) -> Path:
-    source, result = folder / "input", folder / "output"
-    source.mkdir(parents=True)
-    result.mkdir()
-    Image.fromarray(tiny.picture()).save(source / "img.jpg")
-    np.savetxt(source / "cam_K.txt", K)
-    names = {1: "wall", 5: "chair", 25: "television"}
-    rows = [{"bbox": [5, 6, 20 + i, 30], "class": names[box[0]]} for i, box in enumerate(BOXES)]
-    (source / "detections.json").write_text(json.dumps(rows))
-    cells = np.empty((1, len(BOXES)), dtype=object)
-    for i, (_, *box) in enumerate(BOXES):
-        cells[0, i] = cell(*box)
-    savemat(result / "bdb_3d.mat", {"bdb": cells, "class_id": np.array([[b[0] for b in BOXES]])})
-    savemat(result / "r_ex.mat", {"cam_R": attitude()})
-    savemat(result / "layout.mat", {"layout": layout_box()})
-    for i, box in enumerate(BOXES):
-        # One vertex that no face uses counts in the bounds that are stretched to the box.
-        lines = ["v " + " ".join(map(str, v)) for v in [*tiny.STEP.tolist(), [0.0, -0.5, 0.0]]]
-        lines += ["f " + " ".join(str(j + 1) for j in f) for f in tiny.STEP_FACES.tolist()]
-        (result / f"{i}_{box[0]}.obj").write_text("\n".join([*lines, "f 2 2 2", ""]))
-    return folder
+    """With Total3D's own angles of the camera: cam_R = R_y(0) R_z(pitch) R_x(roll)."""
+    attitude = Rotation.from_euler("ZX", [PITCH, ROLL]).as_matrix()
+    R = layouts.T @ attitude.T @ layouts.OURS_TO_T3D
+    return layouts.write_total3d(folder, layouts.Room(K, R, (64, 48), -1.45, THINGS))
 
 
 def test_a_vertex_lands_on_the_pixel_that_total3d_says(tmp_path):
-    found = read("total3d", write(tmp_path / "room"))
+    """By the formulas of its pages, of what stands in the files."""
+    folder = write(tmp_path / "room")
+    found = read("total3d", folder)
     assert [p.id for p in found.scene.objects] == ["chair_0", "television_2"]
     assert [p.support for p in found.scene.objects] == ["ground", "free"]
     assert found.scene.ground == pytest.approx(-1.45)
-    bounds = np.concatenate([tiny.STEP, [[0, -0.5, 0]]])
-    low, high = bounds.min(0), bounds.max(0)
-    for piece, box in zip(found.scene.objects, (BOXES[0], BOXES[2]), strict=True):
-        parts = cell(*box[1:])
-        local = (tiny.STEP - (low + high) / 2) / ((high - low) / 2) * parts["coeffs"]
-        points = local @ parts["basis"] + parts["centroid"]  # rows, in Total3D's world
-        image = points @ attitude() @ np.array([[0, 0, 1], [0, -1, 0], [1, 0, 0]]).T @ K.T
+    boxes = loadmat(folder / "output" / "bdb_3d.mat")["bdb"][0]
+    cam_R = loadmat(folder / "output" / "r_ex.mat")["cam_R"]
+    low, high = VERTS.min(0), VERTS.max(0)
+    for piece, box in zip(found.scene.objects, (boxes[0][0, 0], boxes[2][0, 0]), strict=True):
+        local = (tiny.STEP - (low + high) / 2) / ((high - low) / 2) * box["coeffs"]
+        points = local @ box["basis"] + box["centroid"]  # rows, in Total3D's world
+        image = points @ cam_R @ np.array([[0, 0, 1], [0, -1, 0], [1, 0, 0]]).T @ K.T
         camera = found.scene.camera
         seen = project(to_camera(place_object(piece).verts, camera.R_cam_world), camera.K)
         assert np.allclose(seen.numpy(), image[:, :2] / image[:, 2:], atol=1e-3)
@@ -157,7 +116,7 @@ def test_real_output_is_as_loose_and_tilted_as_known_and_survives_as_a_capture(t
         assert torch.equal(a.mesh.faces, b.mesh.faces)
 
 
-@pytest.mark.parametrize(("at", "byte"), [(144, 7), (320, 0), (321, 255)])
+@pytest.mark.parametrize(("at", "byte"), [(144, 7), (328, 0), (329, 255)])
 def test_a_file_that_kills_its_reader_is_refused(tmp_path, at, byte):
     path = write(tmp_path / "room") / "output" / "bdb_3d.mat"
     content = bytearray(path.read_bytes())

@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from furnished import furnished, two_people, write_out
+from furnished import along_the_axes as along_the_axes  # for every test
+from furnished import furnished, moved, two_people, write_out
 from little_room import GROUND
+from PIL import Image
+from test_export import textured
 
-import mover.io.export.solids
 from mover.core.run import Run
-from mover.core.types import Bodies, Scene, Segment
+from mover.core.types import Bodies, Scene
 from mover.geometry.placement import place_object
 from mover.io.export.finished import Finished, read_finished
 from mover.io.export.solids import AXES, solids_of
@@ -32,11 +34,9 @@ def room() -> Scene:
 
 @pytest.fixture(scope="module")
 def kept(tmp_path_factory):
-    """The convex pieces of the room, cut once, along the axes only (CoACD takes seconds)."""
+    """The convex pieces of the room, cut once."""
     folder = tmp_path_factory.mktemp("kept")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mover.io.export.solids, "find_spec", lambda _: None)
-        solids_of(room(), Run(folder))
+    solids_of(room(), Run(folder))
     return folder
 
 
@@ -47,15 +47,18 @@ def in_file(points: np.ndarray, up: str) -> np.ndarray:
 
 
 @pytest.fixture
-def out(kept, tmp_path, monkeypatch):
-    monkeypatch.setattr(mover.io.export.solids, "find_spec", lambda _: None)
+def out(kept, tmp_path):
     shutil.copytree(kept / "stages", tmp_path / "out" / "stages")
     return tmp_path / "out"
 
 
 def stage_of(out: Path, bodies: Bodies | None = None, **options: Any) -> tuple[Any, Finished]:
     home = read_finished(write_out(out, room(), bodies))
-    return Usd.Stage.Open(str(export_usd(home, out / "export", **options).files[0])), home
+    return opened(home, **options), home
+
+
+def opened(home: Finished, **options: Any) -> Any:
+    return Usd.Stage.Open(str(export_usd(home, home.out / "export", **options).files[0]))
 
 
 def complaints(stage: Any) -> list[str]:
@@ -206,27 +209,26 @@ def test_the_camera_sees_the_same_pixels(out):
     assert [u, v] == pytest.approx(seen[:2] / seen[2], abs=0.01)
 
 
-def test_ids_that_the_file_keeps_for_itself_stay_apart(out):
-    scene = room()
-    names = ("ground", "physics", "wood")
-    pieces = [replace(p, id=n) for p, n in zip(scene.objects, names, strict=True)]
-    home = Finished(out, replace(scene, objects=tuple(pieces)), None, None)
-    stage = Usd.Stage.Open(str(export_usd(home, out).files[0]))
-    ids = [p.GetCustomDataByKey("mover:id") for p in stage.Traverse()]
-    assert set(names) <= set(ids)
+def test_textures_stay_and_ids_that_the_file_does_not_allow_or_has_itself_stay_apart(out):
+    textured(baseColorFactor=[51, 255, 102, 255]).export(out / "box.glb")
+    scene, names = room(), ("ground", "physics", "wood", "0-chair.a", "0-chair_a")
+    chair = replace(scene.objects[0], mesh_file=str(out / "box.glb"))
+    scene = replace(scene, objects=tuple(replace(chair, id=name) for name in names))
+    stage = opened(Finished(out, scene, None, None))
+    ids = {p.GetCustomDataByKey("mover:id") for p in stage.Traverse()} - {None}
+    assert ids == set(names)
+    picture, *_ = (p for p in stage.Traverse() if p.GetName() == "picture")
+    scale = picture.GetAttribute("inputs:scale").Get()
+    assert list(scale) == pytest.approx([0.2, 1.0, 0.4, 1.0])  # glTF multiplies them, too
+    found = Image.open(out / "export" / picture.GetAttribute("inputs:file").Get().path)
+    assert np.array_equal(np.asarray(found).ravel(), np.arange(48))
 
 
 def test_an_object_that_is_moved_stands_still_until_it_stands_elsewhere(out):
-    scene = room()
-    chair, *others = scene.objects
-    later = Segment(12, chair.t_world_object + torch.tensor([0.0, 0.0, 1.0]), chair.yaw + 1)
-    segments = (Segment(0, chair.t_world_object, chair.yaw), later)
-    moved = replace(chair, segments=segments)
-    home = Finished(out, replace(scene, objects=(moved, *others)), None, None)
-    stage = Usd.Stage.Open(str(export_usd(home, out).files[0]))
-    prim = next(p for p in stage.Traverse() if p.GetCustomDataByKey("mover:id") == chair.id)
+    stage = opened(Finished(out, moved(room(), 12), None, None))
+    prim = stage.GetPrimAtPath("/room/chair_0")
     move = prim.GetAttribute("xformOp:translate")
-    z = [round(move.Get(time)[2] - move.Get(0)[2], 6) for time in (5, 11, 12, 40)]
-    assert z == [0, 0, 1, 1]
+    way = [np.subtract(move.Get(time), move.Get(0)).round(6).tolist() for time in (5, 11, 12, 40)]
+    assert way == [[0, 0, 0]] * 2 + [[0.3, 0, 1]] * 2
     turn = prim.GetAttribute("xformOp:rotateY")
     assert turn.Get(30) - turn.Get(11) == pytest.approx(np.degrees(1), abs=1e-3)

@@ -11,7 +11,6 @@ more.
 
 import dataclasses
 import math
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ from mover.io.files.fields import At, read_json
 from mover.io.files.meshes import load_arrays, mesh_of, write_mesh
 from mover.io.files.schema import rotation
 from mover.io.masks.coco import annotations_tree
-from mover.io.scenes.placing import LEVEL, Matrix, Pieces, Placed, about_y
+from mover.io.scenes.placing import LEVEL, Matrix, Pieces, about_y, free_id
 from mover.io.scenes.total3d import CLASSES, FURNITURE
 
 SCENE = Path("models") / "scene.ply"
@@ -60,9 +59,10 @@ def holisticmesh_parts(folder: Path, hints: Hints) -> Parts:
         if category not in FURNITURE:
             continue
         own = verts[i * size : (i + 1) * size]
-        place = partial(upright, mesh_of(own, faces[owner[:, 0] == i] - i * size, at), R)
-        found.add(category, f"{category}_{i}", lambda key, p=place: p(hints.work / f"{key}.glb"))
-        found.rows[-1]["annotation"] = i
+        key = free_id(category, f"{category}_{i}", found.meshes)
+        fields, mesh = upright(mesh_of(own, faces[owner[:, 0] == i] - i * size, at), R)
+        write_mesh(mesh, file := hints.work / f"{key}.glb")
+        found.add(category, key, {**fields, "annotation": i}, mesh, str(file))
         box = row.get("bbox")  # of the mirrored picture, with a score where it has five numbers
         scored = isinstance(box.value, list) and len(box.value) == 5
         left, top, right, bottom = box.vector(5 if scored else 4)[:4]
@@ -80,8 +80,8 @@ def holisticmesh_parts(folder: Path, hints: Hints) -> Parts:
 TURNS = 90  # angles that are tried for the box around a footprint, over a quarter turn
 
 
-def upright(mesh: Mesh, R_cam_world: Matrix, file: Path) -> Placed:
-    """The object of a mesh in camera axes, and a file of it about the middle of its bottom.
+def upright(mesh: Mesh, R_cam_world: Matrix) -> tuple[dict[str, Any], Mesh]:
+    """Fields in scene.json of a mesh in camera axes, and it about the middle of its bottom.
 
     Its box is the upright one with the smallest footprint; its front is the side that faces the
     camera, as that of furniture along walls.
@@ -98,7 +98,5 @@ def upright(mesh: Mesh, R_cam_world: Matrix, file: Path) -> Placed:
     local = verts @ about_y(yaw)  # rows: R_y(-yaw) v
     low, high = local.min(0), local.max(0)
     origin = np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
-    mesh = Mesh(torch.from_numpy(local - origin).float(), mesh.faces)
-    write_mesh(mesh, file)
     fields = {"translation": (about_y(yaw) @ origin).tolist(), "yaw": yaw, "scale": [1.0] * 3}
-    return fields, (mesh, str(file)), ""
+    return fields, Mesh(torch.from_numpy(local - origin).float(), mesh.faces)

@@ -16,8 +16,8 @@ from mover.io.files.npz import read_npz, write_npz
 
 FORMAT, FILE = "mover-contact-labels", "contacts.npz"
 SURE = 0.5  # confidence from which `object_contact` says yes
-WIDTHS = {"position": (3,), "normal": (3,), "gap": (), "confidence": ()}
 INDICES = ("frame", "person", "part", "object")
+REALS = {"position": (3,), "normal": (3,), "gap": (), "confidence": ()}
 
 
 def write_labels(labels: ContactLabels, path: Path) -> None:
@@ -25,7 +25,7 @@ def write_labels(labels: ContactLabels, path: Path) -> None:
     arrays: dict[str, NDArray[Any]] = {
         name: getattr(labels, name).numpy().astype(np.int64) for name in INDICES
     }
-    arrays |= {name: getattr(labels, name).float().numpy() for name in WIDTHS}
+    arrays |= {name: getattr(labels, name).float().numpy() for name in REALS}
     names = {"parts": np.array(labels.parts), "objects": np.array(labels.objects)}
     write_npz({"format": np.array(FORMAT), **arrays, **names}, path)
 
@@ -38,18 +38,16 @@ def read_labels(path: Path) -> ContactLabels:
     """
     if not path.is_file():
         raise InputError(f"{path}: not found; `mover run` writes it for results with people")
-    found = read_npz(path).value
-    missing = [n for n in (*INDICES, *WIDTHS, "parts", "objects") if n not in found]
+    at = read_npz(path)
+    found = at.value
+    missing = [n for n in (*INDICES, *REALS, "parts", "objects") if n not in found]
     if missing or str(found.get("format", "")) != FORMAT:
         lacks = f"lacks {', '.join(missing)}" if missing else "is of another format"
         raise InputError(f"{path.name}: {lacks}, expected the labels that `mover run` writes")
-    rows = len(found["frame"])
-    for name, width in {**dict.fromkeys(INDICES, ()), **WIDTHS}.items():
-        if found[name].shape != (rows, *width):
-            expected = f"expected {(rows, *width)}"
-            raise InputError(f"{path.name}: '{name}' has shape {found[name].shape}, {expected}")
+    rows = len(at.get("frame").indices("rows"))
     return ContactLabels(
-        **{name: torch.from_numpy(found[name]) for name in (*INDICES, *WIDTHS)},
+        **{name: torch.from_numpy(at.get(name).indices(rows)) for name in INDICES},
+        **{name: torch.from_numpy(at.get(name).array((rows, *n))) for name, n in REALS.items()},
         parts=tuple(found["parts"].tolist()),
         objects=tuple(found["objects"].tolist()),
     )

@@ -76,10 +76,9 @@ class Track:
 
     def spans(self) -> list[tuple[float, float]]:
         """Spans of time in which the person is visible [s]."""
-        breaks = (self.time.diff() > GAP).nonzero()[:, 0].tolist()
-        starts, ends = [0, *(b + 1 for b in breaks)], [*breaks, len(self.time) - 1]
-        pairs = zip(starts, ends, strict=True)
-        return [(float(self.time[a]), float(self.time[b])) for a, b in pairs]
+        gaps = (self.time.diff() > GAP).nonzero()[:, 0] + 1
+        pieces = self.time.tensor_split(gaps)
+        return [(float(piece[0]), float(piece[-1])) for piece in pieces]
 
 
 def clock_of(bodies: Bodies | None) -> tuple[int, float]:

@@ -64,9 +64,9 @@ def export_usd(finished: Finished, folder: Path, body: BodyForm = "auto", up: Up
         stage = pxr("Usd").Stage.CreateNew(str(part))
         _head(stage, finished, up)
         _add_scene(stage, finished, folder)
-        for track in [] if bodies is None else tracks_of(bodies):
-            assert bodies is not None
-            _add_person(stage, bodies, track, finished.clock)
+        if bodies is not None:
+            for track in tracks_of(bodies):
+                _add_person(stage, bodies, track, finished.clock)
         stage.GetRootLayer().Save()
     moving = "people's meshes move in straight lines between samples, 2 mm off"
     notes = ("no people" if bodies is None else moving, *scene_glb.losses_of(finished.scene))

@@ -40,14 +40,13 @@ FOREIGN = {
 
 def mask_parts(source: Path, hints: Hints) -> Parts:
     """The objects of a file of masks."""
-    size = None if hints.image is None else image_size(hints.image)
-    camera = None if hints.camera is None else hints.camera.value
-    if size is None and camera is not None and camera.get("w") and camera.get("h"):
+    size, picture, camera = None, "", {} if hints.camera is None else hints.camera.value
+    if hints.image is not None:
+        size, picture = image_size(hints.image), hints.image.name
+    elif camera.get("w") and camera.get("h"):
         size = camera["w"], camera["h"]
-    picture = "" if hints.image is None else hints.image.name
     found = read_things(source, hints.names, size, picture)
-    tree = found.objects_tree()
-    return Parts(name=source.stem, objects=tree, notes=found.notes)
+    return Parts(name=source.stem, objects=found.objects_tree(), notes=found.notes)
 
 
 def read_things(
@@ -64,7 +63,7 @@ def read_things(
     Of several pictures that of the name or with the number of `picture` counts.
     """
     found = read_instances(path, names, size, picture=picture)
-    frames = sorted({item.frame for item in found.items})
+    frames, kept, notes = sorted({item.frame for item in found.items}), found.items, found.notes
     if len(frames) > 1:
         wanted = number_in(Path(picture).stem, -1)
         if wanted not in frames:
@@ -73,16 +72,15 @@ def read_things(
                 f"{path.name}: has things in {len(frames)} images ({few} ...), expected those of "
                 f"{picture or 'the reference picture: give --image'}"
             )
-        kept = tuple(item for item in found.items if item.frame == wanted)
+        kept = tuple(item for item in kept if item.frame == wanted)
         said = f"{path.name}: of {len(frames)} images that with the number of {picture} is taken"
-        found = dataclasses.replace(found, items=kept, notes=(*found.notes, said))
+        notes = (*notes, said)
     else:  # which frame it is does not matter
-        found = dataclasses.replace(found, notes=tuple(n for n in found.notes if "frame" not in n))
-    found = found.fitted(fit or size)
+        notes = tuple(note for note in notes if "frame" not in note)
+    found = dataclasses.replace(found, items=kept, notes=notes).fitted(fit or size)
     if people:
         return found.people()
-    kept = tuple(item for item in found.items if not item.is_person)
-    notes = found.notes
+    kept, notes = tuple(item for item in found.items if not item.is_person), found.notes
     if bare := sum(item.category == UNKNOWN for item in kept):
         notes += (f"{path.name}: {bare} of {len(kept)} masks have no category: --names 1=chair",)
     if people_left := len(found.items) - len(kept):
@@ -99,10 +97,10 @@ def read_people(path: Path, names: Names, size: Size | None, fit: Size | None = 
 def read_instances(
     path: Path, names: Names, size: Size | None, *, people: bool = False, picture: str | None = None
 ) -> Instances:
-    """The instances of any known file or folder of masks.
+    """The instances of a .json, .npz, .npy, .pkl or picture of masks, or of a folder of such.
 
     Args:
-        path: A .json, .npz, .npy, .pkl or picture, or a folder.
+        path: The file or folder.
         names: Categories where the source has none.
         size: Width and height of the image, for sources without it [px].
         people: Whether people in frames are looked for.
@@ -345,15 +343,12 @@ def _of_ultralytics(at: At) -> At:
     for row in at.items():
         box, outline = row.get("box"), row.maybe("segments")
         corners = [box.get(key).number() for key in ("x1", "y1", "x2", "y2")]
-        new = {
-            "class": row.get("name").text(),
-            "bbox": corners,
-            "score": row.value.get("confidence"),
-        }
+        new: dict[str, Any] = {"class": row.get("name").text(), "bbox": corners}
+        new |= {"score": row.value.get("confidence"), "track_id": row.value.get("track_id")}
         if outline is not None:
             x, y = (outline.get(axis).items() for axis in "xy")
             new["segmentation"] = [[v.value for pair in zip(x, y, strict=False) for v in pair]]
-        rows.append({**new, "track_id": row.value.get("track_id")})
+        rows.append(new)
     return at.holding(rows)
 
 
@@ -390,7 +385,7 @@ def _size_of(code: At) -> Size:
 
 
 def _corners(at: At, *, sized: bool) -> tuple[float, ...]:
-    """The corners of a box that may be given by its width and height."""
+    """The corners of a box, which may be given by its width and height."""
     a, b, c, d = at.vector(4)
     return (a, b, a + c, b + d) if sized else (a, b, c, d)
 

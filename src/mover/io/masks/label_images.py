@@ -49,13 +49,8 @@ def read_label_images(
     channel that is not full, or with one value beside black, is one mask, soft rims or not; one
     with more values is a label map (a pixel is the number of a thing, 0 is nothing). Pictures whose
     names are the numbers of frames are a video, in which a label is a track. In a folder of folders
-    (SAM 2's) each is one object of a video.
-
-    Args:
-        paths: The files.
-        source: The folder or file that the user named.
-        names: Categories where the source has none.
-        people: Whether they show people: frames then have short numbers, too.
+    (SAM 2's) each is one object of a video. `source` is the folder or file that the user named; of
+    `people`, frames may have short numbers, too.
     """
     home = source if source.is_dir() else source.parent
     beside = read_json(home / LABELS) if (home / LABELS).is_file() else At({}, LABELS)

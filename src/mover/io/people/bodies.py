@@ -122,9 +122,10 @@ def _in_order(found: Found, file: str) -> Found:
 
 def _posed_as(model: BodyModel, found: Found) -> BodyPose:
     """The parameters; hands whose angles count from flat ones count from the mean hand."""
-    needed = {name: found.values[name] for name in NEEDED}
-    known = ("frame", "person", "K", *NEEDED)
-    extra = {name: value for name, value in found.values.items() if name not in known}
+    extra = dict(found.values)
+    needed = {name: extra.pop(name) for name in NEEDED}
+    for name in ("frame", "person", "K"):
+        extra.pop(name, None)
     if isinstance(model, SkinnedBody) and model.hands is not None and FLAT in extra:
         del extra[FLAT]
         for side, name in enumerate(HAND_POSES):
@@ -139,8 +140,7 @@ def _faces(count: int, model: BodyModel | None, known: Known) -> Int[Tensor, "fa
         if not known.faces.is_file():
             raise InputError(f"--faces: there is no file {known.faces}")
         mesh, _ = read_mesh(At(known.faces.name, str(known.faces)), known.faces.parent)
-        if len(mesh.verts) != count:
-            n = len(mesh.verts)
+        if (n := len(mesh.verts)) != count:
             raise InputError(f"{known.faces}: has {n} vertices, the bodies have {count}")
         return mesh.faces
     if model is None:

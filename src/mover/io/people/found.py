@@ -95,12 +95,8 @@ def followed(
     """Tracks of people that each frame lists in any order.
 
     The nearest pair of a track and a person is joined first, if the person moved no further than
-    `REACH` of the larger of the two sizes, and a little more after a gap.
-
-    Args:
-        frames: Frame of each row.
-        positions: (rows, axes), in any unit.
-        sizes: (rows,), sizes in the same unit.
+    `REACH` of the larger of the two sizes, and a little more after a gap. Positions (rows, axes)
+    and sizes (rows,) have one unit, any.
     """
     tracks, order = np.full(len(frames), -1, dtype=np.int64), np.asarray(frames)
     last: dict[int, int] = {}

@@ -33,10 +33,8 @@ def assumed_lens(
 ) -> At | None:
     """The lens that most tools assume: the principal point is the image's middle.
 
-    Args:
-        known: The user's focal length goes before the tool's.
-        focal: The tool's own, of width and height [px].
-        size: Width and height; None: the user's, without which the lens is not known [px].
+    The user's focal length goes before the tool's, `focal` of width and height [px]; without a
+    `size` [px] that of the user's camera counts, and without either the lens is not known.
     """
     if size is None and known.camera is not None:
         size = known.camera.width, known.camera.height

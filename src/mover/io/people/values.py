@@ -79,14 +79,11 @@ def number_in(name: str, index: int) -> int:
 
 
 def frame_numbers(names: Iterable[str], place: str) -> dict[str, int]:
-    """Frames by the names of their files or folders, as `s001_frame_00012__00.00.00.401`.
+    """Frames by the names (no endings) of their files, as `s001_frame_00012__00.00.00.401`.
 
     The number after `frame` counts, else the last one. Where the names show several shots (s001,
-    s002, ...), each is a still of its own, and they are numbered from 1 in their order.
-
-    Args:
-        names: Of one recording, without endings.
-        place: How messages call it.
+    s002, ...), each is a still of its own, and they are numbered from 1 in their order. Messages
+    call the recording `place`.
 
     Raises:
         InputError: If two names would be one frame.

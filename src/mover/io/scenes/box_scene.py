@@ -7,13 +7,13 @@ centre, full size, and yaw or a rotation.
 import dataclasses
 import math
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from msgspec import Meta, Struct
 
+from mover.core.types import Mesh
 from mover.furniture.library import choose_piece
 from mover.io.capture.parts import Hints, Parts
 from mover.io.files import schema
@@ -23,7 +23,7 @@ from mover.io.files.images import image_size
 from mover.io.files.schema import Id, Text, checked, rotation
 from mover.io.masks.instances import Instance, Instances
 from mover.io.scenes.glb_scene import up_axes
-from mover.io.scenes.placing import LEVEL, Matrix, Pieces, Placed, about_y
+from mover.io.scenes.placing import LEVEL, Matrix, Pieces, about_y, free_id
 
 
 class BoxFields(Struct, frozen=True):
@@ -66,7 +66,9 @@ def box_parts(path: Path, hints: Hints) -> Parts:
     for i, (item, box) in enumerate(zip(at.get("objects").items(), tree.objects, strict=True)):
         kind = Id if isinstance(box.id, int) else Text
         name = "" if box.id is None else str(checked(item.get("id"), kind))
-        found.add(str(box.category), name, partial(_placed, item, box, turn, i))
+        fields, mesh = _placed(item, box, turn, i)
+        category = str(box.category)
+        found.add(category, free_id(category, name, found.meshes), fields, mesh, "")
     return dataclasses.replace(
         found.parts(path.stem, path.name, tree.ground),
         camera=camera,
@@ -74,8 +76,8 @@ def box_parts(path: Path, hints: Hints) -> Parts:
     )
 
 
-def _placed(at: At, box: BoxFields, turn: Matrix, index: int, _key: str) -> Placed:
-    """The object of a box: the mesh of the library that fills it."""
+def _placed(at: At, box: BoxFields, turn: Matrix, index: int) -> tuple[dict[str, Any], Mesh]:
+    """The fields of a box's object in scene.json, and the mesh of the library that fills it."""
     if box.rotation is not None:
         axes = turn @ rotation(at.get("rotation"))  # columns
     elif box.yaw is not None:
@@ -88,12 +90,11 @@ def _placed(at: At, box: BoxFields, turn: Matrix, index: int, _key: str) -> Plac
     low, high = mesh.verts.double().numpy().min(0), mesh.verts.double().numpy().max(0)
     centre = turn @ np.array(box.center)
     place = centre - np.array([0.0, size[1] / 2, 0.0])  # the library stands on its bottom
-    fields = {
+    return {
         "annotation": None if box.box2d is None else index, "translation": place.tolist(),
         "yaw": yaw, "scale": (size / (high - low)).tolist(),
         "support": "ground" if box.support is None else str(box.support),
-    }  # fmt: skip
-    return fields, (mesh, ""), ""
+    }, mesh  # fmt: skip
 
 
 def _upright(at: At, axes: Matrix) -> tuple[Sequence[int], float]:

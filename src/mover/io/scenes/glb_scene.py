@@ -42,14 +42,12 @@ def glb_parts(path: Path, hints: Hints) -> Parts:
         raise InputError(f"{path}: is no .glb or .gltf file, expected a glTF scene")
     scene = load_parts(At(path.name, path.parent.name), path)
     turn = affine(up_axes(hints.up))
-    view = None if hints.camera is not None else _view(path, hints)
-    if view is not None:
+    camera = hints.camera
+    if camera is None and (view := _view(path, hints)) is not None:
         fields, pose = view
         turn[:3, 3] = -turn[:3, :3] @ pose[:3, 3]
         R = FLIP @ pose[:3, :3].T @ turn[:3, :3].T
         camera = At({**fields, "R_cam_world": R.tolist()}, path.name, "cameras")
-    else:
-        camera = hints.camera
     found = Pieces()
     for node in _nodes(scene):
         category = hints.names.get(node) or category_of_name(node)
@@ -137,7 +135,7 @@ def _view(path: Path, hints: Hints) -> tuple[dict[str, Any], Matrix] | None:
         fx = fy if ratio is None else w / 2 / (tangent * ratio)
         fields = {"w": w, "h": h, "fl_x": fx, "fl_y": fy, "cx": w / 2, "cy": h / 2}
         return fields, _pose_of(nodes, index)
-    except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError) as error:
         found = f"a camera that cannot be read ({reason(error)})"
         raise InputError(f"{path.name}: has {found}, expected a perspective camera") from error
 

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -28,8 +28,6 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 """x right, y down, z forward <-> x right, y up, z backward; its own inverse."""
 LEVEL = FLIP.tolist()
 Matrix = NDArray[np.float64]
-Placed = tuple[dict[str, Any], tuple[Mesh, str], str]
-"""Fields of an object of scene.json, its mesh and file, and what was lost."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +35,7 @@ class FilePose:
     """The pose of a mesh in scene.json."""
 
     fields: dict[str, Any]
-    """translation, yaw and scale of scene.json."""
+    """translation, yaw and scale."""
     bake: Matrix | None
     """What its vertices must be multiplied with first (4, 4); None: they stay."""
     note: str
@@ -98,21 +96,28 @@ class Pieces:
     meshes: dict[str, tuple[Mesh, str]] = field(default_factory=dict[str, tuple[Mesh, str]])
     notes: list[str] = field(default_factory=list[str])
 
-    def add(self, category: str, name: str, place: Callable[[str], Placed]) -> None:
-        """Append the object that `place` makes for a free id; `name` is what the tool calls it."""
-        key = free_id(category, name, self.meshes)
-        fields, self.meshes[key], note = place(key)
-        self.notes.extend([f"{key}: {note}"] if note else [])
+    def add(
+        self, category: str, key: str, fields: Mapping[str, Any], mesh: Mesh, file: str
+    ) -> None:
+        """Append an object with a free id and its fields of scene.json."""
+        self.meshes[key] = mesh, file
         self.rows.append({"id": key, "category": category, "mesh": key, **fields})
 
     def add_parts(self, category: str, name: str, scene: Any, matrix: Matrix, work: Path) -> None:  # noqa: ANN401
-        """Append the object of parts that a matrix takes into the world."""
-        self.add(category, name, partial(placed, scene, matrix, work))
+        """Append the object of parts that a matrix takes into the world; its file is in `work`."""
+        key = free_id(category, name, self.meshes)
+        found = write_parts(scene, np.eye(4), work / f"{key}.glb")
+        verts = found[0].verts.double().numpy()
+        pose = posed(matrix, verts.min(0), verts.max(0))
+        if pose.bake is not None:
+            found = write_parts(scene, pose.bake, work / f"{key}.glb")
+        if pose.note:
+            self.notes.append(f"{key}: {pose.note}")
+        self.add(category, key, pose.fields, *found)
 
     def parts(self, name: str, file: str, ground: float | None = None) -> Parts:
         """Parts of a capture with these objects."""
-        tree = scene_tree(self.rows, file, ground)
-        load = partial(load_from, self.meshes)
+        load, tree = partial(load_from, self.meshes), scene_tree(self.rows, file, ground)
         return Parts(name=name, scene=tree, load_mesh=load, notes=tuple(self.notes))
 
 
@@ -156,17 +161,6 @@ def write_parts(scene: Any, matrix: Matrix, path: Path) -> tuple[Mesh, str]:  # 
 def load_from(meshes: Mapping[str, tuple[Mesh, str]], at: At) -> tuple[Mesh, str]:
     """The mesh of this name among those that a reader holds."""
     return meshes[at.value]
-
-
-def placed(scene: Any, matrix: Matrix, work: Path, key: str) -> Placed:  # noqa: ANN401
-    """The object of parts that a matrix takes into the world, and a file of its mesh in `work`."""
-    file = work / f"{key}.glb"
-    mesh, _ = found = write_parts(scene, np.eye(4), file)
-    verts = mesh.verts.double().numpy()
-    pose = posed(matrix, verts.min(0), verts.max(0))
-    if pose.bake is not None:
-        found = write_parts(scene, pose.bake, file)
-    return pose.fields, found, pose.note
 
 
 SAFE = re.compile(r"[^\w.-]+")
