@@ -39,7 +39,7 @@ FOOT = 0.08  # [m], the same of a foot, which errors of the pose move, too
 LOOSE = 0.1  # [m], an error of the farthest camera's position that deserves a warning
 RANGE = (-5.0, 3.0)  # logarithms of the scales that are tried, about the usual ratio
 TRIED = 321
-STEPS = 20  # of reweighted least squares
+STEPS = 20
 BLOCKS = 8  # parts of the video, each left out once for the spread
 DEEP = 3.0  # depths of bodies are so many times as uncertain as their pixels
 FEWEST = 20  # pairs
@@ -112,7 +112,9 @@ def find_scale(inputs: ScaleInputs, config: None = None, observe: Observer = sil
     if len(pairs.moved) < FEWEST or not float(pairs.camera.norm(dim=-1).max()) > 0:
         why = "too few frames with people give the scale of the camera's path: taken as metres"
         return PathScale(1.0, UNKNOWN, (why,))
-    scale = _descended(pairs, _first(parts))
+    scale = _first(parts)
+    for _ in range(STEPS):  # of reweighted least squares
+        scale = _solved(pairs, (1 + _squared(pairs, scale)).square().reciprocal())
     observe(Step("find_scale", 0, 1))
     spread = _spread(pairs, scale)
     warning = (
@@ -184,13 +186,6 @@ def _first(parts: list[_Pairs]) -> float:
     tried = moved / camera.clamp_min(1e-9) * torch.linspace(*RANGE, TRIED).double().exp()
     costs = torch.stack([_cost(pairs, tried) for pairs in parts])
     return float(tried[costs.sum(0).argmin()])
-
-
-def _descended(pairs: _Pairs, scale: float) -> float:
-    """Reweighted least squares from there."""
-    for _ in range(STEPS):
-        scale = _solved(pairs, (1 + _squared(pairs, scale)).square().reciprocal())
-    return scale
 
 
 def _solved(pairs: _Pairs, weight: Float[Tensor, " pairs"]) -> float:
