@@ -50,12 +50,6 @@ FEW = EvaluateConfig(samples=200, bodies=2)
 KNOWN = dict(VARIANTS)
 
 
-def true_scene() -> Scene:
-    scene = little_room.room()
-    things = [replace(p, annotation=i) for i, p in enumerate(scene.objects[:2])]
-    return replace(scene, objects=tuple(things))
-
-
 def small(camera: Camera) -> Camera:
     """The same view in a picture of a quarter of the size."""
     zoom = torch.tensor([0.25, 0.25, 1.0])
@@ -76,8 +70,9 @@ def detections(scene: Scene) -> tuple[Detection, ...]:
 
 def trial(shift: float = 0.2) -> Trial:
     """Two boxes whose initial positions are off, and a person in front of a wrong camera."""
-    truth = true_scene()
-    truth = replace(truth, camera=small(truth.camera))
+    room = little_room.room()
+    things = tuple(replace(p, annotation=i) for i, p in enumerate(room.objects[:2]))
+    truth = replace(room, objects=things, camera=small(room.camera))
     first = tuple(
         replace(p, t_world_object=p.t_world_object + torch.tensor([shift, 0.0, -shift]))
         for p in truth.objects

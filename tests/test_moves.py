@@ -271,10 +271,6 @@ def someone(name: str, way: torch.Tensor, person: int = 0, jitter: float = 0.0) 
     )  # fmt: skip
 
 
-def unknown_parts(bodies: Bodies) -> BodyParts:
-    return BodyParts(torch.full((bodies.verts.shape[1],), -1), torch.zeros(0, 1, dtype=torch.long))
-
-
 def straight(turn: float) -> torch.Tensor:
     """From (0, -3) by .8 m to the right, .3 m ahead, with a turn [rad]."""
     s = share()[:, None]
@@ -291,12 +287,11 @@ def carried(way: torch.Tensor, off: tuple[float, float]) -> list[SceneObject]:
     return places
 
 
-def between(places: list[SceneObject]) -> Between:
-    return Between(places[0], places[-1], BEGIN + 2, END - 2)
-
-
 def followed(places: list[SceneObject], bodies: Bodies) -> Followed | None:
-    return follow_mover(between(places), bodies, unknown_parts(bodies), GROUND)
+    unknown = torch.full((bodies.verts.shape[1],), -1)
+    parts = BodyParts(unknown, torch.zeros(0, 1, dtype=torch.long))
+    between = Between(places[0], places[-1], BEGIN + 2, END - 2)
+    return follow_mover(between, bodies, parts, GROUND)
 
 
 @pytest.mark.parametrize(("name", "off", "hold"), [

@@ -35,7 +35,7 @@ from mover.stages.people.refine_bodies import refine_bodies
 from mover_bench.cli import ExperimentArgs
 from mover_bench.experiment.measures import Judge, Trial, under_camera
 from mover_bench.experiment.sets import RoomSet, changed, parse_seeds, set_named
-from mover_bench.experiment.tables import LOG, path_of, read_finished, write_tables
+from mover_bench.experiment.tables import LOG, path_of, write_tables
 from mover_bench.experiment.variants import VARIANTS, Variant, names_in, withheld
 from mover_bench.rooms.camera_path import filmed
 from mover_bench.rooms.known import KnownRoom, make_room
@@ -170,8 +170,7 @@ def run_experiment(args: ExperimentArgs, observe: Observer = silent, pool: Pool 
     ended = pool("mover_bench.experiment.job", jobs, args.workers)
     for done, index in enumerate(ended, len(seeds) - len(jobs)):
         observe(Step(f"{args.set} {open_seeds[index]}", done, len(seeds)))
-    found = read_finished(args.out, args.set, seeds, names)
-    return write_tables(args, names, found)
+    return write_tables(args, seeds, names)
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -138,9 +138,9 @@ def read_finished(out: Path, rooms: str, seeds: Sequence[int], names: Sequence[s
     return Finished(rows, things, lacking, tuple(sorted(versions)))
 
 
-def write_tables(args: ExperimentArgs, names: Sequence[str], found: Finished) -> Path:
+def write_tables(args: ExperimentArgs, seeds: Sequence[int], names: Sequence[str]) -> Path:
     """Write results.csv, summary.csv and summary.md into OUT/SET; returns the latter."""
-    folder = args.out / args.set
+    folder, found = args.out / args.set, read_finished(args.out, args.set, seeds, names)
     for name, frame in (("results.csv", found.objects), ("summary.csv", found.scenes)):
         with replacing(folder / name) as part:
             frame.to_csv(part, index=False, float_format="%.6g", lineterminator="\n")

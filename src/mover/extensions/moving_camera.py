@@ -135,9 +135,12 @@ def _pairs(inputs: ScaleInputs, point: Float[Tensor, "bodies 3"], noise: float) 
     for person in bodies.person.unique():
         rows = (bodies.person == person).nonzero()[:, 0]
         rows = rows[bodies.frame[rows].argsort()]
+        frame = bodies.frame[rows]
         for wait in WAITS:
-            i, j = _apart(bodies.frame[rows], max(1, round(wait * fps)))
-            i, j = rows[i], rows[j]
+            goal = frame + max(1, round(wait * fps))
+            later = torch.searchsorted(frame, goal).clamp_max(len(frame) - 1)
+            there = frame[later] == goal
+            i, j = rows[there], rows[later[there]]
             ray = torch.nn.functional.normalize(position[i] + position[j], dim=-1)
             moved, camera = position[j] - position[i], t[j] - t[i]
             found.append((_weighted(moved, ray) / noise, _weighted(camera, ray) / noise, block[i]))
@@ -159,13 +162,6 @@ def _weighted(
 ) -> Float[Tensor, "pairs 3"]:
     """Ways of which the part along the ray counts by what depths are less certain (`DEEP`)."""
     return way - (1 - 1 / DEEP) * (way * ray).sum(-1, keepdim=True) * ray
-
-
-def _apart(frame: Int[Tensor, " rows"], wait: int) -> tuple[Tensor, Tensor]:
-    """Pairs of rows that are so many frames apart; the frames rise."""
-    later = torch.searchsorted(frame, frame + wait).clamp_max(len(frame) - 1)
-    there = frame[later] == frame + wait
-    return there.nonzero()[:, 0], later[there]
 
 
 def _cost(pairs: _Pairs, scale: Float[Tensor, " tried"]) -> Float[Tensor, " tried"]:
