@@ -23,8 +23,7 @@ from mover.geometry.rle import decode, encode, tight_box
 from mover.geometry.rotations import rot_x, rot_z
 from mover.io.capture.faults import check_against_picture
 from mover.io.capture.folder import read_capture
-from mover_bench.experiment.job import noisy_room
-from mover_bench.experiment.sets import SETS
+from mover_bench.experiment.job import room_named
 
 Change = Callable[[Capture], Capture | None]
 Z_UP = rot_x(torch.tensor(math.pi / 2))  # (x, y, z) of a y-up world in a z-up one: (x, -z, y)
@@ -123,10 +122,10 @@ def furniture_inverted(capture: Capture) -> Capture | None:
     """Masks of furniture, and their boxes."""
     if any(d.mask is None for d in capture.detections):
         return None
-    found = [replace(d, mask=other(d.mask)) for d in capture.detections if d.mask is not None]
-    boxes = [tight_box(decode(d.mask, 0)) for d in found if d.mask is not None]
+    masks = [other(d.mask) for d in capture.detections if d.mask is not None]
     return replace(capture, detections=tuple(
-        replace(d, box=box.to(d.box)) for d, box in zip(found, boxes, strict=True)))  # fmt: skip
+        replace(d, mask=mask, box=tight_box(decode(mask, 0)).to(d.box))
+        for d, mask in zip(capture.detections, masks, strict=True)))  # fmt: skip
 
 
 def lens(zoom: float, right: float = 0.0) -> Change:
@@ -147,11 +146,6 @@ def rolled(capture: Capture) -> Capture:
     camera = capture.scene.camera
     turned = replace(camera, R_cam_world=HALF_TURN @ camera.R_cam_world)
     return replace(capture, scene=replace(capture.scene, camera=turned))
-
-
-def twice(one: SceneObject) -> Tensor:
-    """A mesh that is in the world already."""
-    return place_object(one).verts
 
 
 def exchanged(capture: Capture) -> Capture | None:
@@ -199,7 +193,7 @@ FAULTS: dict[str, tuple[str, Change]] = {
     "positions with z forward": ("behind", world(diagonal(1, 1, -1), -1)),
     "positions mirrored": ("mirrored", world(diagonal(-1, 1, 1), -1)),
     "whole scene mirrored": ("mirrored", everything(diagonal(-1, 1, 1))),
-    "placements applied twice": ("placed twice", mesh(twice)),
+    "placements applied twice": ("placed twice", mesh(lambda one: place_object(one).verts)),
     "sizes times 4": ("sizes", scaled(4, 1)),
     "sizes times 100": ("sizes are in centimetres", scaled(100, 1)),
     "positions times 100": ("positions are in centimetres", scaled(1, 100)),
@@ -220,20 +214,6 @@ FAULTS: dict[str, tuple[str, Change]] = {
 """What is done to a capture, and words of the warning that is right."""
 
 
-def of_another(capture: Capture, second: Capture) -> dict[str, tuple[str, Capture | None]]:
-    """Parts of another capture in this one."""
-    bodies, camera = second.bodies, second.scene.camera
-    own = capture.scene.camera
-    same = (camera.width, camera.height) == (own.width, own.height)
-    known = {d.id for d in second.detections}
-    lone = all(one.annotation in known or one.annotation is None for one in capture.scene.objects)
-    swapped = replace(capture, scene=replace(capture.scene, objects=second.scene.objects))
-    return {
-        "bodies of another video": ("one video", replace(capture, bodies=bodies) if same else None),
-        "scene of another room": ("one room", swapped if same and lone else None),
-    }
-
-
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser()
@@ -245,9 +225,7 @@ def main() -> None:
     rooms: dict[str, Callable[[], Capture]] = {
         str(path): partial(read_capture, path) for path in args.captures
     }
-    for name in args.rooms:
-        kind, seed = name.split(":")
-        rooms[name] = lambda kind=kind, seed=seed: noisy_room(int(seed), SETS[kind]).capture
+    rooms |= {name: lambda name=name: room_named(name).capture for name in args.rooms}
     found: dict[str, list[bool]] = {name: [] for name in FAULTS}
     alarms: list[str] = []
     unharmed = {str(path): partial(read_capture, path) for path in args.unharmed}

@@ -10,6 +10,7 @@ people.
 
 import argparse
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -29,6 +30,8 @@ from mover_bench.rooms.seen import Seen
 
 DETECTED = (*range(100, 110), 112, 114, 120, 122, 123, 124, 125, 126, 128, 130, 132, 133, 134, 136)
 SEATED, LYING = ("sit", "lean"), ("lie", "lie down", "get up")
+Errors = dict[str, tuple[int, float, float]]
+"""By posture: bodies, and their PJE, absolute and after Procrustes alignment [m]."""
 
 
 def detected(room: KnownRoom, seed: int, fps: float) -> tuple[Keypoints, Camera]:
@@ -77,8 +80,26 @@ def misses(joints: Tensor, truth: Tensor) -> Tensor:
     return torch.stack(pairs, -1)
 
 
-def by_posture(seed: int, fps: float, tall: bool) -> tuple[dict[str, Tensor], Tensor]:
-    """Absolute and Procrustes-aligned PJE of bodies by posture [mm], and errors of heights [%]."""
+def errors_by_posture(pairs: Tensor, room: KnownRoom, rows: list[int]) -> Errors:
+    """Of the errors of some bodies of a room [m]."""
+    which = postures(room, rows).items()
+    return {name: (len(some), *pairs[some].mean(0).tolist()) for name, some in which if some}
+
+
+def lines_of_postures(rooms: list[Errors], head: str = "") -> str:
+    """Means over the bodies of all rooms, and over rooms."""
+    lines: list[str] = []
+    for name in dict.fromkeys(name for room in rooms for name in room):
+        each = np.array([room[name] for room in rooms if name in room])
+        body, equal = np.average(each[:, 1:], 0, each[:, 0]), each[:, 1:].mean(0)
+        count = f"{int(each[:, 0].sum())} bodies of {len(each)} rooms"
+        means = [f"{1e3 * a:.0f} / {1e3 * p:.0f} mm" for a, p in (body, equal)]
+        lines.append(f"{head}{name}: {count}, {means[0]}; rooms weighted equally {means[1]}")
+    return "\n".join(lines)
+
+
+def by_posture(seed: int, fps: float, tall: bool) -> tuple[Errors, Tensor]:
+    """PJE of bodies by posture, and errors of heights [%]."""
     room = make_room(seed, RoomConfig(fps=fps))
     keypoints, camera = detected(room, seed, fps)
     heights = heights_in(room.bodies)
@@ -91,10 +112,8 @@ def by_posture(seed: int, fps: float, tall: bool) -> tuple[dict[str, Tensor], Te
     assert found.bodies.joints is not None
     assert room.bodies.joints is not None
     pairs = misses(found.bodies.joints, room.bodies.joints[rows])
-    each = {name: 1e3 * pairs[which] for name, which in postures(room, rows).items() if which}
-    means = ", ".join(
-        f"{n} {len(v)}: {v[:, 0].mean():.0f} / {v[:, 1].mean():.0f}" for n, v in each.items()
-    )
+    each = errors_by_posture(pairs, room, rows)
+    means = ", ".join(f"{n} {k}: {1e3 * a:.0f} / {1e3 * p:.0f}" for n, (k, a, p) in each.items())
     off = 100 * (heights_in(found.bodies) / heights - 1)
     print(f"room {seed}: {means}, height {off.mean():+.1f} %", flush=True)
     return each, off
@@ -105,12 +124,7 @@ def table(seeds: list[int], fps: float, tall: bool) -> None:
     every = [by_posture(seed, fps, tall) for seed in seeds]
     rooms, off = [room for room, _ in every], torch.cat([some for _, some in every])
     print(f"heights: {off.mean():+.1f} % in the mean, {off.square().mean().sqrt():.1f} % rms")
-    for name in dict.fromkeys(name for room in rooms for name in room):
-        each = [room[name] for room in rooms if name in room]
-        rows = [torch.cat(each), torch.stack([room.mean(0) for room in each])]
-        body, equal = (f"{a:.0f} / {p:.0f}" for a, p in (row.mean(0).tolist() for row in rows))
-        head = f"{name}: {len(rows[0])} bodies of {len(each)} rooms"
-        print(f"{head}, {body} mm; rooms weighted equally {equal}")
+    print(lines_of_postures(rooms))
 
 
 def main() -> None:

@@ -12,6 +12,7 @@ main job with the `robust` preset.
 import argparse
 import json
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,26 +20,18 @@ from tempfile import TemporaryDirectory
 import torch
 
 from mover.core.run import Run
-from mover.core.types import Capture, Scene
+from mover.core.types import Scene
 from mover.furniture.library import catalogue
 from mover.geometry.boxes import box_of, iou3d
-from mover.geometry.rle import decode
 from mover.io.files.meshes import write_mesh
 from mover.perceive.config import LayoutConfig
-from mover.perceive.layout import FirstScene, Picture, first_scene
+from mover.perceive.layout import FirstScene, first_scene
 from mover.pipeline.presets import PRESETS
 from mover.pipeline.reconstruct import reconstruct
+from mover_bench.experiment.judge_i3db import picture_of
 from mover_bench.rooms.config import NoiseConfig
 from mover_bench.rooms.known import KnownRoom, make_room
 from mover_bench.rooms.noise import add_noise
-
-
-def picture_of(capture: Capture) -> Picture:
-    """What the first scene is found from."""
-    camera = capture.scene.camera
-    blank = torch.zeros(camera.height, camera.width, dtype=torch.bool)
-    masks = [blank if d.mask is None else decode(d.mask, 0) for d in capture.detections]
-    return Picture(camera, capture.detections, torch.stack(masks), blank, None, None)
 
 
 def iou(scene: Scene, truth: Scene) -> float:
@@ -51,14 +44,14 @@ def iou(scene: Scene, truth: Scene) -> float:
     return sum(values) / len(values)
 
 
-def other_designs(room: KnownRoom, folder: Path) -> Path:
-    """Shapes of all classes of a room, without any design that stands in it."""
+def other_designs(room: KnownRoom, folder: Path, kinds: Mapping[str, Sequence[str]]) -> Path:
+    """Shapes of classes by the name of their files, without any design that stands in the room."""
     used = {(f.category, f.style) for f in room.furniture}
-    for category in sorted({f.category for f in room.furniture}):
-        shapes = [f for f in catalogue(category) if (category, f.style) not in used]
+    for name, classes in kinds.items():
+        every = [f for kind in classes for f in catalogue(kind)]
+        shapes = [f for f in every if (f.category, f.style) not in used]
         for index, shape in enumerate(shapes):
-            name = f"{category.replace(' ', '_')}_{index}.glb"
-            write_mesh(shape.mesh, folder / name)
+            write_mesh(shape.mesh, folder / f"{name.replace(' ', '_')}_{index}.glb")
     return folder
 
 
@@ -68,8 +61,11 @@ def trial(seed: int, args: argparse.Namespace) -> dict[str, float]:
     capture = add_noise(room, NoiseConfig(), seed)
     begin = time.perf_counter()
     with TemporaryDirectory() as folder:
-        meshes = other_designs(room, Path(folder) / "meshes") if args.other_designs else None
-        first = first_scene(picture_of(capture), LayoutConfig(), Run(Path(folder)), meshes)
+        kinds = {f.category: (f.category,) for f in room.furniture}
+        place = Path(folder) / "meshes"
+        meshes = other_designs(room, place, kinds) if args.other_designs else None
+        picture = picture_of(capture.detections, capture.scene.camera)
+        first = first_scene(picture, LayoutConfig(), Run(Path(folder)), meshes)
         row = {
             "seed": seed,
             "objects": len(room.truth.objects),

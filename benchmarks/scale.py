@@ -13,7 +13,6 @@ import argparse
 import math
 import tempfile
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from unittest.mock import patch
 
@@ -28,8 +27,8 @@ from mover.pipeline import objects
 from mover.pipeline.presets import PRESETS
 from mover.pipeline.reconstruct import reconstruct
 from mover.stages.objects.room_scale import SOURCES, ScaleKnown, common_scale
-from mover_bench.experiment.job import noisy_room
-from mover_bench.experiment.sets import SETS
+from mover_bench.experiment.job import room_named
+from mover_bench.experiment.measures import Trial
 from mover_bench.experiment.tables import LEVEL, RESAMPLES
 
 CHOICES: dict[str, tuple[str, ...]] = {
@@ -89,6 +88,11 @@ def table(rooms: list[dict[str, tuple[float, float]]]) -> list[str]:
     return lines
 
 
+def of_trial(trial: Trial) -> tuple[Capture, float]:
+    """The capture of a known room, and how high its camera is [m]."""
+    return trial.capture, -(trial.truth.ground or math.nan)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("captures", nargs="*", help="CAPTURE=HEIGHT")
@@ -100,9 +104,7 @@ def main() -> None:
         path, height = name.rsplit("=", 1)
         cases[path] = lambda path=path, height=height: (read_capture(Path(path)), float(height))
     for name in args.rooms:
-        kind, seed = name.split(":")
-        trial = partial(noisy_room, int(seed), SETS[kind])
-        cases[name] = lambda trial=trial: (trial().capture, -(trial().truth.ground or math.nan))
+        cases[name] = lambda name=name: of_trial(room_named(name))
     found: list[dict[str, tuple[float, float]]] = []
     for name, case in cases.items():
         errors = errors_of(*case())

@@ -22,10 +22,11 @@ from pathlib import Path
 import torch
 
 from mover.app.demo import write_demo
-from mover.core.records import map_tensors
 from mover.core.types import Capture, Detection, Masks, SceneObject
 from mover.geometry.rle import decode, encode
 from mover.io.capture.folder import read_capture, write_capture
+from mover.io.capture.pose_file import joined_bodies
+from mover_bench.rooms.moved import joined_people
 
 TIMES, ZOOM = 4, 2
 STEP = 0.02  # [m] between a copy and the next
@@ -85,28 +86,10 @@ def many_frames(capture: Capture) -> Capture:
     bodies, people = capture.bodies, capture.people
     assert bodies is not None
     assert people is not None
-    length = int(bodies.frame.max()) + 1
-
-    def again(rows: torch.Tensor) -> torch.Tensor:
-        return rows.repeat(TIMES, *[1] * (rows.ndim - 1))
-
-    def later(frame: torch.Tensor) -> torch.Tensor:
-        return torch.cat([frame + length * k for k in range(TIMES)])
-
-    joints = None if bodies.joints is None else again(bodies.joints)
-    pose = None if bodies.pose is None else map_tensors(again, bodies.pose)
-    masks = replace(people.masks, counts=people.masks.counts * TIMES)
-    return replace(
-        capture,
-        bodies=replace(
-            bodies, verts=again(bodies.verts), joints=joints, pose=pose,
-            frame=later(bodies.frame), person=again(bodies.person),
-        ),
-        people=replace(
-            people, masks=masks, frame=later(people.frame), person=again(people.person)
-        ),
-        touch=None,
-    )  # fmt: skip
+    later = [(int(bodies.frame.max()) + 1) * k for k in range(TIMES)]
+    every = joined_bodies([replace(bodies, frame=bodies.frame + k) for k in later])
+    seen = joined_people([replace(people, frame=people.frame + k) for k in later])
+    return replace(capture, bodies=every, people=seen, touch=None)
 
 
 CASES: dict[str, Callable[[Capture], Capture]] = {

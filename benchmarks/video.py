@@ -20,7 +20,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from fit import heights_in, misses, postures
+from fit import Errors, errors_by_posture, heights_in, lines_of_postures, misses
+from layout import other_designs
 
 from mover.app.cli.run import reconstruct_into
 from mover.app.cli.video import VideoArgs, video_to_room
@@ -31,16 +32,17 @@ from mover.core.types import Scene
 from mover.evaluate.bodies import shared_rows
 from mover.evaluate.evaluation import EvaluatedBodies, evaluate
 from mover.evaluate.scene import SIDES
-from mover.furniture.library import WIDE_CLASSES, canonical, catalogue
+from mover.furniture.library import canonical, meanings
 from mover.geometry.camera import to_camera, to_world
 from mover.geometry.placement import place_object
 from mover.geometry.raster import Crops, Topology, look
 from mover.geometry.rle import decode
 from mover.geometry.topology import edges_of
 from mover.io.capture.bodies_file import read_bodies
+from mover.io.capture.camera_file import camera_to_json
 from mover.io.capture.folder import read_capture
 from mover.io.capture.scene_file import read_scene
-from mover.io.files.meshes import write_mesh
+from mover.io.files.fields import write_json
 from mover.pipeline.presets import PRESETS
 from mover_bench.experiment.sets import parse_seeds
 from mover_bench.rooms.config import NoiseConfig, RoomConfig
@@ -51,18 +53,6 @@ from mover_bench.rooms.seen import COCO, Seen
 FPS = 5.0
 KINDS = ("depth", "disparity")
 KEYS = ("iou3d", "p2s", "center_error", "contact_f1", "pje", "p_pje")
-
-
-def other_designs(room: KnownRoom, folder: Path) -> Path:
-    """Shapes of all that COCO calls furniture, without any design that stands in the room."""
-    used = {(canonical(piece.category), piece.style) for piece in room.furniture}
-    for name in sorted(set(COCO.values())):
-        kinds = sorted({canonical(kind) for kind in WIDE_CLASSES.get(name, (name,))})
-        every = [piece for kind in kinds for piece in catalogue(kind)]
-        shapes = [p for p in every if (canonical(p.category), p.style) not in used]
-        for index, shape in enumerate(shapes):
-            write_mesh(shape.mesh, folder / f"{canonical(name)}_{index}.glb")
-    return folder
 
 
 def truth_of(room: KnownRoom, capture: Path) -> dict[str, int]:
@@ -160,31 +150,15 @@ def scale_of(found: Path, room: KnownRoom) -> dict[str, float]:
     return {f"{side} scale": (s.ground or np.nan) / room.truth.ground for side, s in scenes.items()}
 
 
-def errors_by_posture(found: Path, room: KnownRoom) -> dict[str, tuple[int, float, float]]:
-    """Bodies, and PJE of the refined ones in the room, absolute and after Procrustes [m]."""
+def refined_errors(found: Path, room: KnownRoom) -> Errors:
+    """Of the refined bodies in the room."""
     bodies, camera = read_bodies(found / "bodies.npz"), read_scene(found / "scene.json").camera
     there, true = in_world(bodies, camera), in_world(room.bodies, room.truth.camera)
     rows, true_rows = shared_rows(there, true)
     assert there.joints is not None
     assert true.joints is not None
-    off, aligned = misses(there.joints[rows], true.joints[true_rows]).unbind(-1)
-    return {
-        name: (len(which), float(off[which].mean()), float(aligned[which].mean()))
-        for name, which in postures(room, true_rows.tolist()).items()
-        if which
-    }
-
-
-def lines_of_postures(rows: list[dict[str, tuple[int, float, float]]]) -> str:
-    """Means over the bodies of all rooms, and over rooms."""
-    lines: list[str] = []
-    for name in dict.fromkeys(name for row in rows for name in row):
-        each = np.array([row[name] for row in rows if name in row])
-        body, equal = np.average(each[:, 1:], 0, each[:, 0]), each[:, 1:].mean(0)
-        count = f"{int(each[:, 0].sum())} bodies of {len(each)} rooms"
-        means = [f"{1e3 * a:.0f} / {1e3 * p:.0f} mm" for a, p in (body, equal)]
-        lines.append(f"refined, {name}: {count}, {means[0]}; rooms weighted equally {means[1]}")
-    return "\n".join(lines)
+    pairs = misses(there.joints[rows], true.joints[true_rows])
+    return errors_by_posture(pairs, room, true_rows.tolist())
 
 
 def lines_of_objects(metrics: dict[str, Any]) -> str:
@@ -210,9 +184,12 @@ def trial(seed: int, out: Path, args: argparse.Namespace) -> dict[str, Any]:
     if not (out / "video.mp4").is_file():
         save_film((draw_frame(room, k) for k in frames), FPS, out / "video.mp4")
     seen = Seen(room, add_noise(room, NoiseConfig(), seed), seed)
-    meshes = other_designs(room, out / "meshes") if args.other_designs else None
+    kinds = {canonical(name): sorted(meanings(name)) for name in sorted(set(COCO.values()))}
+    meshes = other_designs(room, out / "meshes", kinds) if args.other_designs else None
     heights = tuple(heights_in(room.bodies).tolist()) if args.height else ()
-    lens = lens_file(room, out)
+    lens, fields = out / "lens.json", camera_to_json(room.truth.camera)
+    del fields["R_cam_world"]  # its tilt is not given
+    write_json(fields, lens)
     chain = VideoArgs(out / "video.mp4", out / "chain", camera=lens, meshes=meshes, height=heights)
     video_to_room(chain, seen.finders())
     capture, row = out / "chain" / "capture", dict[str, Any]()
@@ -227,7 +204,7 @@ def trial(seed: int, out: Path, args: argparse.Namespace) -> dict[str, Any]:
         print(f"room {seed} {kind}", lines_of_objects(metrics), sep="\n", flush=True)
         row |= {f"{word}{s} {k}": metrics[s][k] for s in SIDES for k in KEYS if k in metrics[s]}
         row |= {f"{word}{name}": value for name, value in scale_of(place, room).items()}
-        row |= {f"{word}postures": errors_by_posture(place, room)}
+        row |= {f"{word}postures": refined_errors(place, room)}
         row |= {f"{word}farther": farther(metrics), f"{word}objects": len(metrics["objects"])}
     steps = json.loads((out / "chain" / "steps.json").read_text())["steps"]
     row |= {f"{name} [s]": step["seconds"] for name, step in steps.items()}
@@ -235,16 +212,6 @@ def trial(seed: int, out: Path, args: argparse.Namespace) -> dict[str, Any]:
     row["room [s]"] = sum(stage["seconds"] for stage in stages)
     kept.write_text(json.dumps(row))
     return row
-
-
-def lens_file(room: KnownRoom, out: Path) -> Path:
-    """The true lens; its tilt is not given."""
-    camera, names = room.truth.camera, ("fl_x", "fl_y", "cx", "cy")
-    K = camera.K
-    values = map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
-    lens = {"w": camera.width, "h": camera.height, **dict(zip(names, values, strict=True))}
-    (out / "lens.json").write_text(json.dumps(lens))
-    return out / "lens.json"
 
 
 def main() -> None:
@@ -262,7 +229,7 @@ def main() -> None:
     for name in names:
         values = [row[name] for row in rows.values() if name in row]
         if isinstance(values[0], dict):
-            print(lines_of_postures(values))
+            print(lines_of_postures(values, "refined, "))
             continue
         if isinstance(values[0], list):
             print(f"{name}: {'; '.join(f'{s}: {v}' for s, row in rows.items() for v in row[name])}")

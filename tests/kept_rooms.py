@@ -5,16 +5,18 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 from mover.core.observe import Observer, silent
 from mover.core.records import rows_of
 from mover.core.run import Run, sources
-from mover.core.types import Bodies, Capture
+from mover.core.types import Bodies, Capture, People
 from mover_bench.rooms.config import RoomConfig
 from mover_bench.rooms.known import KnownRoom, demo_room, make_room
 
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mover-tests"
 FEW = 2  # rooms of one kind that are kept: of these sources, and of those before them
+Rows = TypeVar("Rows", Bodies, People)
 Make = Callable[["Recipe", RoomConfig, Observer], KnownRoom]
 
 
@@ -58,18 +60,11 @@ def _forget(folder: Path) -> None:
         path.with_suffix(".npz").unlink(missing_ok=True)
 
 
-def some(bodies: Bodies, every: int = 8) -> Bodies:
-    """Bodies of every so many frames."""
-    return rows_of(bodies, bodies.frame % every == 0)
+def some(rows: Rows, every: int = 8) -> Rows:
+    """Bodies, or masks of people, of every so many frames."""
+    return rows_of(rows, rows.frame % every == 0)
 
 
 def thinned(capture: Capture, every: int = 8) -> Capture:
     """Every so many frames of the people."""
-    bodies, people = capture.bodies, capture.people
-    rows = (people.frame % every == 0).nonzero()[:, 0]
-    counts = tuple(people.masks.counts[k] for k in rows.tolist())
-    fewer = replace(
-        people, masks=replace(people.masks, counts=counts), frame=people.frame[rows],
-        person=people.person[rows],
-    )  # fmt: skip
-    return replace(capture, bodies=some(bodies, every), people=fewer)
+    return replace(capture, bodies=some(capture.bodies, every), people=some(capture.people, every))

@@ -26,7 +26,6 @@ from mover.geometry.rle import decode
 from mover_bench.rooms.known import KnownRoom
 
 SIZE = (1920, 1080)
-SHIFT = np.array([1.0, 2.0, 1.5])
 
 
 def write_body_model(folder: Path) -> Path:
@@ -50,7 +49,7 @@ def write_recording(
     root: Path, plain: layouts.Room, name: str, room: KnownRoom, rows: list[int], fits: list[str]
 ) -> None:
     """A recording of some rows of a room's first person, whose fits are the truth."""
-    layouts.write_prox(root, plain, name, len(rows), SHIFT)
+    layouts.write_prox(root, plain, name, len(rows))
     model = load_smpl("smplx", "male")
     pose = smplx_people(room, rows, model)
     verts, joints = model.posed(pose)

@@ -25,6 +25,7 @@ NYU40 = {
 }  # fmt: skip
 FLIP = np.diag([1.0, -1.0, -1.0])
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # our world -> one with z up
+SHIFT = np.array([1.0, 2.0, 1.5])  # [m], where the camera stands in the frame of a scan
 
 
 @dataclass
@@ -328,16 +329,16 @@ def body_index(size: tuple[int, int], index: int) -> Image.Image:
     return Image.fromarray(pixels)
 
 
-def write_prox(root: Path, room: Room, recording: str, frames: int, shift: np.ndarray) -> Path:
-    """The camera stands at `shift` in the scan's frame; pictures are stored mirrored."""
+def write_prox(root: Path, room: Room, recording: str, frames: int) -> Path:
+    """The camera stands at `SHIFT` in the scan's frame; pictures are stored mirrored."""
     place = recording.split("_")[0]
     for name in ("calibration", "cam2world", "scenes"):
         (root / name).mkdir(parents=True, exist_ok=True)
     lens = {"camera_mtx": (room.K - HALF).tolist(), "k": [0.1, 0.0, 0.0, 0.0, 0.0]}
     (root / "calibration" / "Color.json").write_text(json.dumps(lens))
-    cam2world = four(Z_UP @ room.R.T, shift)
+    cam2world = four(Z_UP @ room.R.T, SHIFT)
     (root / "cam2world" / f"{place}.json").write_text(json.dumps(cam2world.tolist()))
-    scan(room).apply_transform(four(Z_UP, shift)).export(root / "scenes" / f"{place}.ply")
+    scan(room).apply_transform(four(Z_UP, SHIFT)).export(root / "scenes" / f"{place}.ply")
     color = root / "recordings" / recording / "Color"
     keypoints = root / "keypoints" / recording
     index = root / "recordings" / recording / "BodyIndexColor"
@@ -362,9 +363,9 @@ def write_prox(root: Path, room: Room, recording: str, frames: int, shift: np.nd
 def write_pigraphs(root: Path, room: Room, name: str, joints: np.ndarray, *, mirror: bool) -> Path:
     """Joints (frames, 25, 3) in the camera's axes; Kinect's x is left, or right if `mirror`."""
     root.mkdir(parents=True, exist_ok=True)
-    place, shift = name.split("_")[0], [1.0, 2.0, 1.5]
+    place = name.split("_")[0]
     kinect = np.diag([1.0, -1, 1]) if mirror else np.diag([-1.0, -1, 1])  # from x right, y down
-    scan_cam = four(Z_UP @ room.R.T @ kinect, shift)
+    scan_cam = four(Z_UP @ room.R.T @ kinect, SHIFT)
     times = [1000 + 200 * i for i in range(len(joints))]
     rows = [{"trackingId": 72057594037928000 + 1, "timestamp": time,
              "jointPositions": (pose @ kinect).tolist()}
@@ -380,7 +381,7 @@ def write_pigraphs(root: Path, room: Room, name: str, joints: np.ndarray, *, mir
             groups.append({
                 "id": len(groups), "label": f"{t.category}:{part}", "objectId": i,
                 "dominantNormal": [0, 0, 1], "segments": [],
-                "obb": {"centroid": (Z_UP @ middle + shift).tolist(),
+                "obb": {"centroid": (Z_UP @ middle + SHIFT).tolist(),
                         "axesLengths": (t.size * [1, 0.5, 1]).tolist(),
                         "normalizedAxes": axes.ravel().tolist()},
             })  # fmt: skip
@@ -388,7 +389,7 @@ def write_pigraphs(root: Path, room: Room, name: str, joints: np.ndarray, *, mir
             0, 0, 1]}  # fmt: skip
     groups.append({"id": 999, "label": "wall", "objectId": 999, "obb": wall, "segments": []})
     (root / f"{place}d.segs.json").write_text(json.dumps({"segGroups": groups}))
-    scan(room).apply_transform(four(Z_UP, shift)).export(root / f"{place}.ply")
+    scan(room).apply_transform(four(Z_UP, SHIFT)).export(root / f"{place}.ply")
     return root
 
 

@@ -1,4 +1,4 @@
-"""Whole scenes against the truth: what is best, what is absent, what is written."""
+"""Whole scenes against the truth: what is best, what is absent, what is written, what harms."""
 
 import json
 from dataclasses import replace
@@ -11,6 +11,7 @@ from judged import CAMERA, FAST, GROUND, SELF_CONTAINED, cuboid, moved, pair, pe
 
 from mover.bodies.corrected import in_world
 from mover.core.errors import InputError
+from mover.core.types import Scene
 from mover.evaluate.bodies import soles_of
 from mover.evaluate.evaluation import (
     FIRST,
@@ -23,6 +24,7 @@ from mover.evaluate.evaluation import (
 from mover.evaluate.scene import unmatched
 from mover.evaluate.stability import PHYSICS_METRICS
 from mover.geometry.camera import tilted, to_camera
+from mover.geometry.rotations import rot_y
 from mover.io.capture.bodies_file import write_bodies
 from mover.io.capture.scene_file import write_scene
 
@@ -147,9 +149,7 @@ def test_the_folder_gives_the_same_numbers_and_writes_them(tmp_path: Path) -> No
     wrong = replace(truth, objects=tuple(moved(p, 0.2, 0, 0) for p in truth.objects))
     out, true = tmp_path / "out", tmp_path / "truth"
     write_scene(truth, true / "scene.json")
-    write_scene(truth, out / "scene.json")
-    write_scene(wrong, out / "scene.json")
-    (out / "scene.json").rename(out / "initial.json")
+    write_scene(wrong, out / "initial.json")
     write_scene(truth, out / "scene.json")
     write_bodies(bodies, out / "bodies.npz")
     write_bodies(bodies, true / "bodies.npz")
@@ -265,3 +265,54 @@ def test_a_floor_that_rises_over_standing_feet_is_penetrated_by_its_rise() -> No
     expected = 0.3 - float(soles.mean())
     assert metrics["initial"]["ground_penetration_distance"] == pytest.approx(expected, abs=1e-5)
     assert metrics["result"]["ground_penetration_frequency"] == 0
+
+
+def grown(scene: Scene, scale: float, yaw: float, step: tuple[float, float, float]) -> Scene:
+    """The scene after an upright similarity."""
+    turn = scale * rot_y(torch.tensor(yaw).double())
+    pieces = [
+        replace(p, t_world_object=turn @ p.t_world_object + torch.tensor(step),
+                yaw=p.yaw + yaw, scale=p.scale * scale)
+        for p in scene.objects
+    ]  # fmt: skip
+    return replace(scene, objects=tuple(pieces))
+
+
+def with_first_moved(scene: Scene, z: float) -> Scene:
+    return replace(scene, objects=(moved(scene.objects[0], 0, 0, z), *scene.objects[1:]))
+
+
+def test_a_similarity_of_the_whole_room_costs_nothing_once_it_is_taken_out() -> None:
+    truth = room()
+    found = evaluate(truth, grown(truth, 0.9, 0.1, (0.2, 0.05, -0.3)), truth)["result"]
+    assert found["iou3d"] < 0.7
+    assert found["iou3d_aligned"] == pytest.approx(1.0, abs=1e-4)
+
+
+def test_two_objects_fit_always_so_that_they_say_nothing() -> None:
+    truth = replace(room(), objects=room().objects[:2])
+    assert "iou3d_aligned" not in evaluate(truth, truth, truth)["result"]
+
+
+def test_a_missing_object_counts_as_none_after_the_similarity_too() -> None:
+    truth = room()
+    other = replace(moved(truth.objects[0], 0, 0, 1.5), id="other", annotation=None)
+    more = replace(truth, objects=(*truth.objects, other))
+    found = evaluate(truth, truth, more)["result"]
+    assert found["iou3d_aligned"] == pytest.approx(len(truth.objects) / len(more.objects), abs=1e-4)
+
+
+@pytest.mark.parametrize(("off", "by_10"), [(0.05, 0), (0.15, 1), (-0.3, 1), (0.7, 1)])
+def test_objects_that_end_farther_from_the_truth_than_given_are_counted(off, by_10):
+    truth = room()
+    found = evaluate(truth, with_first_moved(truth, off), truth)
+    count = len(truth.objects)
+    assert found["result"]["worse_by_10cm"] == pytest.approx(by_10 / count)
+    assert found["objects"][0]["result"]["worse_by_10cm"] == by_10
+    assert found["initial"]["worse_by_10cm"] == 0
+
+
+def test_what_was_given_wrong_and_comes_nearer_is_no_harm() -> None:
+    truth = room()
+    found = evaluate(with_first_moved(truth, 2.0), with_first_moved(truth, 1.0), truth)["result"]
+    assert found["worse_by_10cm"] == 0

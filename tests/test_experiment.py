@@ -31,9 +31,9 @@ from mover.geometry.rle import encode, tight_box
 from mover.pipeline.presets import PRESETS, Config
 from mover.stages.people.refine_bodies import RefinedBodies
 from mover_bench.cli import ExperimentArgs
-from mover_bench.experiment import job, run
+from mover_bench.experiment import job
+from mover_bench.experiment.job import Jobs, run_each, run_experiment
 from mover_bench.experiment.measures import Judge, Trial
-from mover_bench.experiment.run import Jobs, run_each, run_experiment
 from mover_bench.experiment.sets import CHANGES, SETS, changed, parse_seeds
 from mover_bench.experiment.tables import head_of, interval
 from mover_bench.experiment.variants import (
@@ -48,12 +48,6 @@ from mover_bench.experiment.variants import (
 
 FEW = EvaluateConfig(samples=200, bodies=2)
 KNOWN = dict(VARIANTS)
-
-
-def true_scene() -> Scene:
-    scene = little_room.room()
-    things = [replace(p, annotation=i) for i, p in enumerate(scene.objects[:2])]
-    return replace(scene, objects=tuple(things))
 
 
 def small(camera: Camera) -> Camera:
@@ -76,8 +70,9 @@ def detections(scene: Scene) -> tuple[Detection, ...]:
 
 def trial(shift: float = 0.2) -> Trial:
     """Two boxes whose initial positions are off, and a person in front of a wrong camera."""
-    truth = true_scene()
-    truth = replace(truth, camera=small(truth.camera))
+    room = little_room.room()
+    things = tuple(replace(p, annotation=i) for i, p in enumerate(room.objects[:2]))
+    truth = replace(room, objects=things, camera=small(room.camera))
     first = tuple(
         replace(p, t_world_object=p.t_world_object + torch.tensor([shift, 0.0, -shift]))
         for p in truth.objects
@@ -308,7 +303,7 @@ def test_the_command_names_what_it_does_not_know(flags, said, tmp_path, capsys) 
 
 
 def test_a_missing_extra_is_one_sentence_before_anything_runs(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(run, "find_spec", lambda _: None)
+    monkeypatch.setattr(job, "find_spec", lambda _: None)
     assert run_command("experiment", ["--seeds", "0", "--out", str(tmp_path)]) == 2
     said = capsys.readouterr().err
     assert "pandas is not installed; pip install -e '.[bench]' in mover's folder" in said

@@ -1,4 +1,4 @@
-"""i3DB, on a scene made in its layout and, where it is, on the real one."""
+"""Real sets: i3DB, on a scene made in its layout and, where it is, on the real one; clips."""
 
 import json
 import math
@@ -13,6 +13,8 @@ from mover.geometry.boxes import box_of
 from mover.geometry.camera import pitch_roll, tilted
 from mover_bench.cli import ExperimentArgs
 from mover_bench.datasets.i3db import HALPE, JOINTS, read_i3db
+from mover_bench.experiment.judge_clips import judge_clips, tops_below
+from mover_bench.experiment.judge_clips import table_of as table_of_clips
 from mover_bench.experiment.judge_i3db import judge_i3db, overlaps, table_of, wrongly_placed
 
 REAL = Path(__file__).parents[2] / "shared" / "data" / "i3db"
@@ -114,3 +116,26 @@ def test_the_real_scene_reads_as_it_was_measured_by_others() -> None:
         -4.72, abs=0.1
     )
     assert len(scene.keypoints.frame) == 175
+
+
+def test_the_surface_under_a_point_is_the_highest_one_below_it():
+    square = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1]])
+    floor, seat = square * 4 - 1, square + torch.tensor([0, 0.5, 0.0])
+    slope = square.clone()
+    slope[:, 1] = 0.2 * slope[:, 0]
+    slope[:, 0] += 2
+    faces = torch.cat([x[torch.tensor([[0, 1, 2], [0, 2, 3]])] for x in (floor, seat, slope)])
+    points = torch.tensor([[0.5, 0.6, 0.5], [0.5, 0.4, 0.4], [0.5, 0.3, 0.4], [2.5, 0.9, 0.5]])
+    above = torch.tensor([[9.0, 1.0, 9.0]])
+    found = tops_below(torch.cat([points, above]), faces)
+    assert found.tolist() == pytest.approx([0.5, 0.5, -1, 0.1, -torch.inf], abs=1e-6)
+
+
+def test_a_folder_without_clips_is_refused_and_a_table_has_a_row_for_each_object(tmp_path: Path):
+    for source in (None, tmp_path):
+        with pytest.raises(InputError, match="--source: expected a folder of clips"):
+            judge_clips(ExperimentArgs(set="clips", source=source))
+    rows = [{"object": "bed_0", "size": "1.00 x 0.50 x 2.00", "iou": 0.7}, {"object": "chair_0"}]
+    table = table_of_clips({"a": {"stature": 1.7, "objects": rows}})
+    assert table.count("\n| a | 1.7 |") == 2
+    assert "| bed_0 | 1.00 x 0.50 x 2.00 |" in table

@@ -1,4 +1,4 @@
-"""The noise model: its statistics are those that its configuration names, and the truth stays."""
+"""The noise model: its errors are those that its configuration names, and the truth stays."""
 
 import dataclasses
 import math
@@ -9,14 +9,20 @@ import torch
 
 from mover.bodies.skinning import open_body
 from mover.core.records import fingerprint, rows_of
-from mover.core.types import Bodies, BodyPose, Capture, Detection, SceneObject
-from mover.geometry.camera import pitch_roll
+from mover.core.types import Capture, Detection, SceneObject
+from mover.furniture.library import PIECES, make_piece
+from mover.geometry.boxes import box_of
+from mover.geometry.camera import pitch_roll, project, to_camera
+from mover.geometry.nearest import to_surface
 from mover.geometry.rle import decode
 from mover.geometry.rotations import axis_angle, rot_y
+from mover.geometry.topology import is_closed
+from mover_bench.rooms import foreign
 from mover_bench.rooms.config import NoiseConfig
+from mover_bench.rooms.foreign import MAKERS, foreign_mesh
 from mover_bench.rooms.known import KnownRoom
 from mover_bench.rooms.noise import add_noise, slow
-from mover_bench.rooms.noise_masks import grown, leaked
+from mover_bench.rooms.noise_masks import coarse, grown, leaked, wobbled
 
 SILENT = NoiseConfig(
     along_ray=0, sideways=0, yaw=0, flips=0, scale=0, camera=0, depth_bias=0, depth_drift=0, pose=0,
@@ -27,11 +33,6 @@ SILENT = NoiseConfig(
 def noisy(tiny: KnownRoom, seed: int = 0, **errors: float) -> Capture:
     """A capture with these errors alone."""
     return add_noise(tiny, dataclasses.replace(SILENT, **errors), seed)
-
-
-def posed(bodies: Bodies | None) -> tuple[Bodies, torch.Tensor, BodyPose]:
-    """Bodies with their joints and parameters, which known rooms have."""
-    return bodies, bodies.joints, bodies.pose
 
 
 def shown(one: Detection) -> torch.Tensor:
@@ -57,7 +58,7 @@ def test_no_noise_gives_the_truth_back(tiny: KnownRoom) -> None:
     for given, true in pairs(tiny, capture):
         for name in ("t_world_object", "yaw", "scale"):
             assert torch.allclose(getattr(given, name), getattr(true, name), atol=1e-6)
-    assert torch.allclose(posed(capture.bodies)[0].verts, tiny.bodies.verts, atol=5e-5)
+    assert torch.allclose(capture.bodies.verts, tiny.bodies.verts, atol=5e-5)
     assert capture.people.masks.counts == tiny.capture.people.masks.counts
     assert capture.scene.ground is None
 
@@ -155,8 +156,8 @@ def test_other_shapes_and_classes_fill_the_same_box(tiny: KnownRoom, error: str)
 
 
 def test_depth_bias_moves_a_body_along_its_ray_and_keeps_its_size(tiny: KnownRoom) -> None:
-    bodies, joints, _ = posed(noisy(tiny, 4, depth_bias=0.03).bodies)
-    pelvis, given = posed(tiny.bodies)[1][:, 0], joints[:, 0]
+    bodies = noisy(tiny, 4, depth_bias=0.03).bodies
+    pelvis, given = tiny.bodies.joints[:, 0], bodies.joints[:, 0]
     factor = (given / pelvis)[:, 2]
     assert torch.allclose(given, pelvis * factor[:, None], atol=1e-4)
     assert float(factor.std()) < 1e-4
@@ -166,14 +167,14 @@ def test_depth_bias_moves_a_body_along_its_ray_and_keeps_its_size(tiny: KnownRoo
 
 
 def test_pose_errors_turn_every_joint_by_the_stated_angle(tiny: KnownRoom) -> None:
-    bodies, _, pose = posed(noisy(tiny, pose=4.0).bodies)
-    both = (pose, posed(tiny.bodies)[2])
+    bodies = noisy(tiny, pose=4.0).bodies
+    both = (bodies.pose, tiny.bodies.pose)
     wrong, right = (axis_angle(p.body_pose.double().reshape(-1, 21, 3)) for p in both)
     step = right.mT @ wrong
     cosine = ((step.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1)
     rms = float(cosine.acos().square().mean().sqrt().rad2deg())
     assert abs(rms - 4 * math.sqrt(3)) < 0.6, "4 degrees about each of three axes"
-    assert torch.allclose(open_body().posed(pose)[0], bodies.verts, atol=1e-4)
+    assert torch.allclose(open_body().posed(bodies.pose)[0], bodies.verts, atol=1e-4)
 
 
 def test_slow_noise_has_variance_one_and_forgets_in_time() -> None:
@@ -185,12 +186,12 @@ def test_slow_noise_has_variance_one_and_forgets_in_time() -> None:
 
 
 def test_jitter_and_dropped_rows_follow_their_configuration(tiny: KnownRoom) -> None:
-    bodies, _, pose = posed(noisy(tiny, 1, jitter=0.015, dropped=0.2).bodies)
+    bodies = noisy(tiny, 1, jitter=0.015, dropped=0.2).bodies
     kept = torch.isin(tiny.bodies.frame, bodies.frame)
     assert 0.05 < 1 - float(kept.float().mean()) < 0.35
     shift = (bodies.verts - tiny.bodies.verts[kept])[:, 0]
     assert abs(float(shift.std()) - 0.015) < 0.002
-    assert len(pose.transl) == len(bodies.frame)
+    assert len(bodies.pose.transl) == len(bodies.frame)
 
 
 def test_masks_grow_and_shrink_by_whole_pixels() -> None:
@@ -261,3 +262,97 @@ def test_merged_masks_are_the_union_of_two_and_one_object_is_missing(tiny: Known
     assert torch.equal(unions.any(0), torch.stack(list(true.values())).any(0)), "no pixel is lost"
     for mask in (true[k] for k in true if k not in left):
         assert any(bool((union & mask).sum() == mask.sum()) for union in unions)
+
+
+@pytest.mark.parametrize("maker", MAKERS, ids=lambda m: m.__name__.strip("_"))
+@pytest.mark.parametrize("name", ["chair", "shelf", "sofa"])
+def test_a_foreign_mesh_fills_the_box_and_is_another_shape(name, maker, monkeypatch):
+    monkeypatch.setattr(foreign, "MAKERS", (maker,))
+    known = make_piece(name, np.random.default_rng(1), 0)
+    mesh, again = (foreign_mesh(known, 0.03, np.random.default_rng(5)) for _ in range(2))
+    assert torch.equal(mesh.verts, again.verts)
+    found = (mesh.verts.amax(0) - mesh.verts.amin(0)).double()
+    assert torch.allclose(found, torch.tensor(known.size).double(), atol=1e-4)
+    away = to_surface(known.mesh.verts, mesh.verts, mesh.faces).mean()
+    assert 0.005 < float(away) < 0.3
+
+
+def test_every_piece_has_foreign_meshes_and_most_are_open_or_unclean() -> None:
+    meshes = [
+        foreign_mesh(make_piece(name, np.random.default_rng(k)), 0.03, np.random.default_rng(k))
+        for k, name in enumerate(PIECES)
+    ]
+    assert sum(is_closed(mesh.faces) for mesh in meshes) < len(meshes) / 2
+
+
+def test_a_mask_head_keeps_what_is_large_and_loses_what_is_thin() -> None:
+    mask = np.zeros((200, 300), dtype=bool)
+    mask[50:150, 60:240] = True
+    mask[20:50, 100:103] = True
+    drawn = coarse(mask, np.array([60.0, 20.0, 240.0, 150.0]), 28)
+    assert (drawn & mask).sum() / (drawn | mask).sum() > 0.9
+    assert drawn[20:45, 100:103].mean() < 0.5
+    assert not drawn[:, :55].any()
+
+
+def test_an_outline_wobbles_by_the_stated_pixels() -> None:
+    mask = np.zeros((200, 300), dtype=bool)
+    mask[40:160, 50:250] = True
+    off = [
+        wobbled(mask, 2.5, np.random.default_rng(seed))[60:140].argmax(1) - 50.0
+        for seed in range(40)
+    ]  # an island before the outline counts as the outline: a little more than 2.5
+    assert 2.0 < np.std(off) < 4.0
+    assert abs(np.mean(off)) < 1.0
+
+
+def test_amodal_masks_hold_what_is_hidden(tiny: KnownRoom) -> None:
+    both = zip(noisy(tiny, amodal=1.0).detections, tiny.capture.detections, strict=True)
+    grown = [int(shown(a).sum()) - int(shown(b).sum()) for a, b in both]
+    assert min(grown) >= 0
+    assert max(grown) > 0
+
+
+def test_mean_bodies_have_one_shape_and_fill_their_pictures(tiny: KnownRoom) -> None:
+    given = noisy(tiny, mean_bodies=True).bodies
+    assert float(given.pose.betas.abs().max()) == 0
+
+    def height(verts: torch.Tensor) -> torch.Tensor:
+        pixel = project(verts, tiny.truth.camera.K)[..., 1]
+        return pixel.amax(-1) - pixel.amin(-1)
+
+    share = height(given.verts) / height(tiny.bodies.verts)
+    assert 0.93 < float(share.median()) < 1.07
+    assert open_body().posed(given.pose)[0].sub(given.verts).abs().max() < 1e-4
+
+
+def test_a_biased_pose_stays_biased(tiny: KnownRoom) -> None:
+    off = noisy(tiny, pose_bias=6.0).bodies.pose.body_pose - tiny.bodies.pose.body_pose
+    assert float(off.mean(0).abs().mean()) > 3 * float(off.std(0).median())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_wrong_lens_keeps_the_picture_and_the_widths(tiny: KnownRoom, seed: int) -> None:
+    capture = noisy(tiny, seed, lens=0.055)
+    zoom = float(capture.scene.camera.K[0, 0] / tiny.truth.camera.K[0, 0])
+    assert 0.029 < abs(zoom - 1) < 0.081
+
+    def seen(piece: SceneObject, K: torch.Tensor) -> torch.Tensor:
+        return project(to_camera(box_of(piece).center, tiny.truth.camera.R_cam_world), K)
+
+    for given, true in pairs(tiny, capture):
+        assert torch.allclose(size(given), size(true), atol=1e-5)
+        pixels = seen(given, capture.scene.camera.K), seen(true, tiny.truth.camera.K)
+        assert torch.allclose(*pixels, atol=0.05)
+    given, true = capture.bodies.joints, tiny.bodies.joints
+    assert torch.allclose(given[:, 0, 2], true[:, 0, 2] * zoom, atol=1e-3)
+    assert torch.allclose(given[..., :2], true[..., :2], atol=1e-4)
+
+
+def test_the_other_sets_do_not_change(tiny: KnownRoom) -> None:
+    """New errors have streams of their own."""
+    plain, lens = add_noise(tiny, NoiseConfig(), 3), add_noise(tiny, NoiseConfig(lens=0.05), 3)
+    assert [p.yaw for p in plain.scene.objects] == [p.yaw for p in lens.scene.objects]
+    assert plain.detections == lens.detections or all(
+        torch.equal(a.box, b.box) for a, b in zip(plain.detections, lens.detections, strict=True)
+    )

@@ -1,10 +1,10 @@
 """The paper's tables on a user's own copy: rows, jobs, pages, and what a perfect result scores."""
 
-import csv
 import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import make_people as made
 import make_scenes as layouts
@@ -12,13 +12,15 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from test_import_datasets import prox_room
+from test_experiment import rows_of as lines_of
+from test_import_datasets import FIRST, SECOND, prox_room, write_stills
 from test_import_scenes import imported
 from test_import_scenes import plain as plain  # the fixture
-from test_prox import FIRST, SECOND, write_stills
+from test_readers_people import Toy
 from test_readers_people import models as models  # the fixture: the body that the fits are of
 
 from mover.app.cli import run_command
+from mover.bodies import BODY_MODELS
 from mover.core.errors import InputError
 from mover.core.records import rows_of
 from mover.evaluate.bodies import feet_places, soles_of
@@ -27,6 +29,7 @@ from mover.io.capture.folder import read_capture
 from mover.io.capture.scene_file import read_scene
 from mover_bench.cli import TableArgs
 from mover_bench.experiment import paper_rows as rows
+from mover_bench.experiment.job import Jobs
 from mover_bench.experiment.paper_job import (
     DONE,
     TableJob,
@@ -37,7 +40,6 @@ from mover_bench.experiment.paper_job import (
 )
 from mover_bench.experiment.paper_rows import TABLES
 from mover_bench.experiment.paper_table import paper_table, planned
-from mover_bench.experiment.run import Jobs
 from mover_bench.rooms.known import KnownRoom
 
 
@@ -69,10 +71,6 @@ def copy(stood: layouts.Room, tmp_path_factory: pytest.TempPathFactory) -> Path:
     source = layouts.write_glb(work / "in.glb", stood)
     with pytest.MonkeyPatch.context() as patch:
         for name in made.COUNTS:
-            from test_readers_people import Toy
-
-            from mover.bodies import BODY_MODELS
-
             patch.setitem(BODY_MODELS, name, lambda _, name=name: Toy(name))
         boxes = stills / "boxes" / "bbox3d.json"
         imported("prox", stills, out, work, recordings=(FIRST, SECOND), boxes=boxes)
@@ -158,18 +156,18 @@ class Answers:
         (job.folder / DONE).write_text(json.dumps(tree))
 
 
-def named_captures(folder: Path, *names: str) -> Path:
-    for name in names:
-        (folder / name / "truth").mkdir(parents=True)
-        (folder / name / "truth" / "scene.json").write_text("{}")
-    return folder
+def asked_for(tmp_path: Path, table: str, *names: str, **asked: Any) -> TableArgs:
+    """A table of captures of these names, of which there is nothing but that they have a truth."""
+    for name in names or ("vicon_03301",):
+        (tmp_path / "c" / name / "truth").mkdir(parents=True)
+        (tmp_path / "c" / name / "truth" / "scene.json").write_text("{}")
+    return TableArgs(table, tmp_path / "c", tmp_path / "out", **asked)
 
 
 @pytest.mark.parametrize("name", list(TABLES))
 def test_every_table_makes_all_of_its_rows_once(name: str, tmp_path: Path) -> None:
-    there = named_captures(tmp_path / "c", "MPH8_00034_01", "vicon_03301", "room_kitchen_1")
-    args = TableArgs(name, there, tmp_path / "out", workers=2)
-    answers = Answers()
+    names = "MPH8_00034_01", "vicon_03301", "room_kitchen_1"
+    args, answers = asked_for(tmp_path, name, *names, workers=2), Answers()
     page = paper_table(args, pool=answers).read_text()
     assert len(answers.done) == len(set(answers.done))
     wanted = {"prox": "MPH8_00034_01", "prox-quantitative": "vicon_03301"}
@@ -184,8 +182,7 @@ def test_every_table_makes_all_of_its_rows_once(name: str, tmp_path: Path) -> No
             row.label for row in part.ours if not row.detected and not row.job.startswith("fits-")
         ]
         assert sum("(paper)" in x for x in lines) == len(part.quoted)
-    with (args.results / f"{name}-robust.csv").open(newline="") as file:
-        numbers = list(csv.DictReader(file))
+    numbers = lines_of(args.results / f"{name}-robust.csv")
     full = next(x for x in numbers if x["row"] == "full")
     assert float(full["iou3d"]) == (50 if name == "pigraphs" else 0.5)
     again = Answers()
@@ -193,22 +190,37 @@ def test_every_table_makes_all_of_its_rows_once(name: str, tmp_path: Path) -> No
     assert again.done == []
 
 
-def test_people_are_in_millimetres_and_overlaps_as_the_paper_prints_them(tmp_path: Path) -> None:
-    there = named_captures(tmp_path / "c", "vicon_03301")
-    args = TableArgs("prox-quantitative", there, tmp_path / "out", only=("baseline", "initial"))
+@pytest.mark.parametrize(("table", "capture", "asked", "lines"), [
+    ("prox-quantitative", "vicon_03301", {"only": ("baseline", "initial")}, [
+        "| baseline | 170.0 | 180.0 |", "| initial | 0.250 |",
+        "| *MOVER, +CamGP+SDF+Contact* (paper) | 174.4 | 178.3 |",
+    ]),
+    ("prox", "MPH8_00034_01", {"only": ("10 s",)}, [
+        f"| 10 s | 0.500 | {np.std(0.01 * np.arange(10), ddof=1):.3f} | 1 |",
+        "| *10 s* (paper) | 0.389 | 0.018 |",
+    ]),
+    ("prox", "MPH8_00034_01", {"only": ("initial", "full"), "detected": "c"}, [
+        "| initial, detected | 0.250 |", "| *Total3D, PointRend* (paper) | 0.246 |",
+    ]),
+], ids=["people in millimetres", "spread of segments", "detected captures"])  # fmt: skip
+def test_rows_that_are_asked_for_are_printed_as_the_paper_prints_them(
+    table, capture, asked, lines, tmp_path
+):
+    if "detected" in asked:
+        asked = {**asked, "detected": tmp_path / asked["detected"]}
+    args = asked_for(tmp_path, table, capture, **asked)
     page = paper_table(args, pool=Answers()).read_text()
-    assert "| baseline | 170.0 | 180.0 |" in page
-    assert "| *MOVER, +CamGP+SDF+Contact* (paper) | 174.4 | 178.3 |" in page
-    assert "| initial | 0.250 |" in page
+    for line in lines:
+        assert line in page
     assert "+ depth" not in page
 
 
 def test_what_other_jobs_need_is_done_first_and_the_given_scene_needs_no_job(tmp_path):
-    there = named_captures(tmp_path / "c", "vicon_03301", "vicon_03301_b")
-    (there / "vicon_03301" / "fits").mkdir()
-    (there / "vicon_03301" / "fits" / "RGB.npz").touch()
+    args = asked_for(tmp_path, "prox-quantitative", "vicon_03301", "vicon_03301_b")
+    (args.captures / "vicon_03301" / "fits").mkdir()
+    (args.captures / "vicon_03301" / "fits" / "RGB.npz").touch()
     answers = Answers()
-    page = paper_table(TableArgs("prox-quantitative", there, tmp_path / "out"), pool=answers)
+    page = paper_table(args, pool=answers)
     first = [name for _, name in answers.done[:4]]
     assert sorted(first) == ["full", "full", "people-baseline", "people-baseline"]
     assert ("vicon_03301", "fits-RGB") in answers.done
@@ -218,10 +230,8 @@ def test_what_other_jobs_need_is_done_first_and_the_given_scene_needs_no_job(tmp
 
 
 def test_the_plan_counts_jobs_and_takes_the_time_of_those_that_have_ended(tmp_path: Path) -> None:
-    there = named_captures(tmp_path / "c", "vicon_03301")
-    args = TableArgs(
-        "prox-quantitative", there, tmp_path / "out", "paper", only=("initial", "full")
-    )
+    only = ("initial", "full")
+    args = asked_for(tmp_path, "prox-quantitative", preset="paper", only=only)
     assert planned(args).startswith("2 jobs of 1 captures, 2 to do: about 0.1 h of one core")
     few = replace(args, steps=100)
     assert planned(few).startswith("2 jobs of 1 captures, 2 to do: about 0.0 h of one core")
@@ -230,21 +240,11 @@ def test_the_plan_counts_jobs_and_takes_the_time_of_those_that_have_ended(tmp_pa
     assert "10 jobs of 1 captures, 8 to do: about 8.0 h of one core (as the 2" in every
 
 
-def test_lengths_have_the_spread_of_their_segments(tmp_path: Path) -> None:
-    there = named_captures(tmp_path / "c", "MPH8_00034_01")
-    args = TableArgs("prox", there, tmp_path / "out", only=("10 s",))
-    page = paper_table(args, pool=Answers()).read_text()
-    assert f"| 10 s | 0.500 | {np.std(0.01 * np.arange(10), ddof=1):.3f} | 1 |" in page
-    assert "| *10 s* (paper) | 0.389 | 0.018 |" in page
-
-
 def test_fewer_steps_are_other_jobs_of_the_same_command_line(tmp_path: Path) -> None:
     job = TableJob(tmp_path, tmp_path / "out", "paper", "full", 50, "auto", "weights")
     assert TableJob.of(job.words) == job
-    assert (job.variant.config.layout.method.steps, job.variant.config.place.method.steps) == (
-        50,
-        50,
-    )
+    config = job.variant.config
+    assert (config.layout.method.steps, config.place.method.steps) == (50, 50)
     assert key_of(job) != key_of(replace(job, steps=0))
     assert key_of(job) != key_of(replace(job, preset="robust"))
     assert key_of(job) == key_of(replace(job, device="cpu", vposer=""))
@@ -271,18 +271,8 @@ def test_feet_are_the_soles_that_posa_names_and_contacts_are_those_of_the_bodies
     assert named_contacts(known, replace(bodies, frame=bodies.frame + 100)) is None
 
 
-def test_detected_captures_have_rows_of_their_own(tmp_path: Path) -> None:
-    there = named_captures(tmp_path / "c", "MPH8_00034_01")
-    other = named_captures(tmp_path / "d", "MPH8_00034_01")
-    args = TableArgs("prox", there, tmp_path / "out", detected=other, only=("initial", "full"))
-    page = paper_table(args, pool=Answers()).read_text()
-    assert "| initial, detected | 0.250 |" in page
-    assert "| *Total3D, PointRend* (paper) | 0.246 |" in page
-
-
 def test_a_job_that_fails_is_named_and_done_again(tmp_path: Path) -> None:
-    there = named_captures(tmp_path / "c", "vicon_03301")
-    args = TableArgs("prox-quantitative", there, tmp_path / "out")
+    args = asked_for(tmp_path, "prox-quantitative")
     page = paper_table(args, pool=Answers(broken="people-sdf")).read_text()
     assert "**Failed**: vicon_03301, people-sdf: ValueError: no floor" in page
     assert "| + CamGP + SDF | - | - | - | - | 0 |" in page
@@ -292,10 +282,10 @@ def test_a_job_that_fails_is_named_and_done_again(tmp_path: Path) -> None:
 
 
 def test_what_is_asked_wrongly_is_one_sentence(tmp_path: Path, capsys) -> None:
-    there = named_captures(tmp_path / "c", "vicon_03301")
+    args = asked_for(tmp_path, "prox")
     with pytest.raises(InputError, match="has no capture of PROX qualitative"):
-        paper_table(TableArgs("prox", there, tmp_path / "out"))
-    words = ["prox-quantitative", str(there), str(tmp_path / "out"), "--preset", "best"]
+        paper_table(args)
+    words = ["prox-quantitative", str(args.captures), str(args.results), "--preset", "best"]
     assert run_command("paper-table", words) == 2
     assert "--preset: 'best' is none of paper, robust, printed" in capsys.readouterr().err
 

@@ -1,6 +1,5 @@
 """`mover paper-table` end to end: every row, from files in the layout of PROX and of PiGraphs."""
 
-import csv
 import re
 import traceback
 from collections.abc import Iterator
@@ -10,7 +9,7 @@ import make_prox
 import make_scenes as layouts
 import numpy as np
 import pytest
-from test_experiment import quick
+from test_experiment import quick, rows_of
 from test_import_datasets import prox_room
 from test_import_scenes import imported
 from test_import_scenes import plain as plain  # the fixture
@@ -20,10 +19,10 @@ from mover_bench.cli import TableArgs
 from mover_bench.datasets.pigraphs import NAMES
 from mover_bench.experiment import paper_job
 from mover_bench.experiment import paper_rows as rows
+from mover_bench.experiment.job import Jobs
 from mover_bench.experiment.paper_job import TableJob, do_job
 from mover_bench.experiment.paper_rows import TABLES
 from mover_bench.experiment.paper_table import asked, paper_table
-from mover_bench.experiment.run import Jobs
 from mover_bench.rooms.known import KnownRoom
 
 STILLS = ("vicon_03301_01", "vicon_03301_02")
@@ -88,8 +87,8 @@ def made(args: TableArgs, patch: pytest.MonkeyPatch) -> dict[tuple[str, str], di
     page = paper_table(args, pool=at_once).read_text()
     assert "Failed" not in page
     assert "Not run" not in page
-    with (args.results / f"{args.table}-paper.csv").open(newline="") as file:
-        return {(line["table"], line["row"]): line for line in csv.DictReader(file)}
+    lines = rows_of(args.results / f"{args.table}-paper.csv")
+    return {(line["table"], line["row"]): line for line in lines}
 
 
 def kinds(name: str) -> tuple[str, ...]:

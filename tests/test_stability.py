@@ -117,8 +117,6 @@ def test_every_class_of_the_library_has_a_density():
 
 @needs_mujoco
 def test_mujoco_reads_the_model_with_everything_in_place(tmp_path: Path):
-    import mujoco
-
     scene = furnished((*BOXES, "shelf"))
     pieces = [
         dataclasses.replace(p, scale=torch.tensor([1.1, 0.9, 1.2]), support=s)
@@ -126,9 +124,7 @@ def test_mujoco_reads_the_model_with_everything_in_place(tmp_path: Path):
     ]
     scene = dataclasses.replace(scene, objects=tuple(pieces))
     home = read_finished(write_out(tmp_path / "out", scene))
-    path = export_mjcf(home, tmp_path).files[0]
-    model = mujoco.MjModel.from_xml_path(str(path))
-    data = mujoco.MjData(model)
+    mujoco, model, data = simulated(export_mjcf(home, tmp_path).files[0])
     mujoco.mj_forward(model, data)
     assert model.njnt == 2  # the table hangs
     for given in pieces:
@@ -155,6 +151,14 @@ def test_mujoco_reads_the_model_with_everything_in_place(tmp_path: Path):
     assert [u, v] == pytest.approx(seen[:2] / seen[2], abs=0.05)
 
 
+def simulated(file: Path) -> tuple[Any, Any, Any]:
+    """The simulator with a model and its state."""
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_path(str(file))
+    return mujoco, model, mujoco.MjData(model)
+
+
 def corners(model: Any, data: Any, geom: int) -> tuple[np.ndarray, int]:
     """Vertices of a mesh in the world, and its group."""
     mesh = model.geom_dataid[geom]
@@ -166,14 +170,11 @@ def corners(model: Any, data: Any, geom: int) -> tuple[np.ndarray, int]:
 
 @needs_mujoco
 def test_keyframes_put_furniture_where_it_then_stands(tmp_path: Path):
-    import mujoco
-
     home = read_finished(write_out(tmp_path / "out", furnished(BOXES)))
     objects = moved(home.scene, 8).objects[::-1]
     scene = dataclasses.replace(home.scene, objects=objects)
     file = export_mjcf(dataclasses.replace(home, scene=scene), tmp_path).files[0]
-    model = mujoco.MjModel.from_xml_path(str(file))
-    data = mujoco.MjData(model)
+    mujoco, model, data = simulated(file)
     assert [model.key(k).name for k in range(model.nkey)] == ["frame_0", "frame_8"]
     for key, frame in enumerate((0, 8)):
         mujoco.mj_resetDataKeyframe(model, data, key)
@@ -238,9 +239,10 @@ def test_without_mujoco_the_way_to_get_it_is_named(tmp_path: Path, monkeypatch):
 @pytest.mark.parametrize("seed", range(10))
 def test_the_truth_of_known_rooms_stands_still(seed: int, tmp_path: Path):
     from mover_bench.rooms.compose import draw_plan
+    from mover_bench.rooms.config import RoomConfig
     from mover_bench.rooms.known import scene_of
 
-    plan = draw_plan(np.random.default_rng([seed, 0]), (960, 540), 9, 500)
+    plan = draw_plan(np.random.default_rng([seed, 0]), RoomConfig())
     for found in settle(scene_of(plan), Run(tmp_path), 3.0):
         assert found.moved < 0.01, found
 

@@ -20,7 +20,7 @@ import torch
 from mover.core.errors import InputError
 from mover.core.types import Mesh
 from mover.io.capture.parts import Hints, Parts
-from mover.io.files.fields import At, read_json
+from mover.io.files.fields import At, existing, read_json
 from mover.io.files.meshes import load_arrays, mesh_of, write_mesh
 from mover.io.files.schema import rotation
 from mover.io.masks.coco import annotations_tree
@@ -37,10 +37,8 @@ def holisticmesh_parts(folder: Path, hints: Hints) -> Parts:
     if not (folder / SCENE).is_file():
         why = "that main.py writes where the scene is given to render_image"
         raise InputError(f"{SCENE}: there is no such file in {folder}, expected the mesh {why}")
-    if not (folder / "detections.json").is_file():
-        why = "the one of its --data_path, whose order names the objects"
-        raise InputError(f"detections.json: there is no such file in {folder}, expected {why}")
-    rows = read_json(folder / "detections.json").items()
+    named = "the one of its --data_path, whose order names the objects"
+    rows = read_json(existing(folder / "detections.json", named)).items()
     names = [row.get("class").choice(CLASSES) for row in rows]
     given = {} if hints.camera is None else dict(hints.camera.value)
     tilt = None if hints.camera is None else hints.camera.maybe("R_cam_world")

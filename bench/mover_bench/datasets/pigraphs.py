@@ -120,9 +120,7 @@ def pigraphs_parts(root: Path, hints: Hints) -> Parts:
     lens = LENS if hints.camera is None else hints.camera.value
     notes = [] if mirror else ["the pictures of this recording are mirrored and are flipped"]
     joints = _skeletons(at)
-    bodies = None
-    if joints:
-        bodies = At(capsule_people(joints, to_camera, FPS), path.name)
+    bodies = At(capsule_people(joints, to_camera, FPS), path.name) if joints else None
     parts = Parts(name=path.stem, camera=At(lens, path.name), bodies=bodies, notes=tuple(notes))
     if hints.image is not None:
         load, size = image_parts(hints.image, mirrored=not mirror)

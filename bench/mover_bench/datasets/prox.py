@@ -8,7 +8,7 @@ authors (--boxes), and in the quantitative part the bodies of MoSh. The capture 
 that: its camera is level, its furniture comes from elsewhere. What is missing is named.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,7 @@ import torch
 
 from mover.core.errors import InputError
 from mover.core.files import copy_whole
-from mover.core.types import Bodies, Scene
+from mover.core.types import Bodies
 from mover.io.capture.bodies_file import bodies_to_arrays, write_bodies
 from mover.io.capture.camera_file import camera_of
 from mover.io.capture.parts import Hints, Parts, image_parts
@@ -50,6 +50,8 @@ from mover_bench.datasets.prox_files import (
 )
 from mover_bench.datasets.true_boxes import TrueBox, boxes_scene, floor_in, read_bbox3d, read_scan
 
+Files = dict[str, Callable[[Path], object]]
+"""What writes files beside the capture, by their places in it."""
 COSTS = {
     "Color": "no pictures: nothing to draw on, masks of furniture must come from elsewhere",
     "BodyIndexColor": "no masks of people: no depth order",
@@ -85,19 +87,19 @@ def prox_parts(root: Path, hints: Hints) -> Parts:
     trees: dict[str, Any] = {}
     for line, found in zip(lines, fits, strict=True):
         trees |= keypoint_trees(line, found, camera_of(lens), notes)
-    fps = None if lines[0].stills else FPS
+    notes += _missing(lines)
     masks = body_indices(lines, tracks)
     name = recordings[0].name if len(recordings) == 1 else recordings[0].scene
     parts = Parts(
         name=name,
         camera=lens,
         bodies=None if bodies is None else At(bodies_to_arrays(bodies), name),
-        people=people_of(masks, fps),
-        beside={place: partial(write_json, tree) for place, tree in trees.items()},
-        notes=(*notes, *_missing(lines)),
+        people=people_of(masks, None if lines[0].stills else FPS),
     )
-    parts = _with_pictures(_with_given_fits(parts, lines, tracks), lines, masks, hints)
-    return _with_truth(parts, lines, lens, hints)
+    files: Files = {place: partial(write_json, tree) for place, tree in trees.items()}
+    parts = _with_pictures(parts, lines, masks, hints, files, notes)
+    files |= _given_fits(lines, tracks) | _truth(lines, lens, hints, notes)
+    return replace(parts, beside=files, notes=tuple(notes))
 
 
 def _missing(lines: Sequence[Timeline]) -> list[str]:
@@ -105,10 +107,8 @@ def _missing(lines: Sequence[Timeline]) -> list[str]:
     notes: list[str] = []
     for line in lines:
         name, root = line.recording.name, line.recording.root
-        lacking = {
-            kind: FOLDERS[kind].format(name) for kind in ("Color", "BodyIndexColor", "keypoints")
-        }
-        lacking = {kind: place for kind, place in lacking.items() if not line.files(kind)}
+        kinds = ("Color", "BodyIndexColor", "keypoints")
+        lacking = {kind: FOLDERS[kind].format(name) for kind in kinds if not line.files(kind)}
         if not any(line.files(kind) for kind in FITS):
             kind = "fittings/PROX" if line.stills else FITS[0]
             lacking["fits"] = FOLDERS[kind].format(name)
@@ -121,47 +121,51 @@ def _missing(lines: Sequence[Timeline]) -> list[str]:
     return list(dict.fromkeys(notes))
 
 
-def _with_given_fits(parts: Parts, lines: Sequence[Timeline], tracks: Mapping[str, int]) -> Parts:
-    """The parts with the fits of stills that the paper compares with, in fits/."""
-    beside = dict(parts.beside)
+def _given_fits(lines: Sequence[Timeline], tracks: Mapping[str, int]) -> Files:
+    """The fits of stills that the paper compares with, in fits/."""
+    files: Files = {}
     for kind in GIVEN_FITS if lines[0].stills else ():
         found = [(line, _fits(line, (f"fittings/{kind}",), [])) for line in lines]
         bodies = _joined(found, tracks, [])
         if bodies is not None:
-            beside[f"fits/{kind}.npz"] = partial(write_bodies, bodies)
-    return replace(parts, beside=beside)
+            files[f"fits/{kind}.npz"] = partial(write_bodies, bodies)
+    return files
 
 
 def _with_pictures(
-    parts: Parts, lines: Sequence[Timeline], masks: Mapping[int, Instance | None], hints: Hints
+    parts: Parts,
+    lines: Sequence[Timeline],
+    masks: Mapping[int, Instance | None],
+    hints: Hints,
+    files: Files,
+    notes: list[str],
 ) -> Parts:
-    """The parts with all pictures, flipped left to right.
+    """The parts with a reference image; all pictures, flipped left to right, are among the files.
 
     The reference image is the one with the fewest pixels of people (the paper: without human-object
     occlusion), whose masks say where they are; without masks it is the first.
     """
     from PIL import ImageOps
 
-    beside = dict(parts.beside)
     paths = [(line, *one) for line in lines for one in line.files("Color").items()]
     for line, frame, path in paths:
         target = hints.work / line.recording.name / f"mirrored_{path.stem}.jpg"
         target.parent.mkdir(parents=True, exist_ok=True)
         with opened(path) as picture:
             ImageOps.mirror(picture.convert("RGB")).save(target, quality=95)
-        beside[f"frames/{frame:06d}.jpg"] = partial(copy_whole, target)
+        files[f"frames/{frame:06d}.jpg"] = partial(copy_whole, target)
     if not paths:
         return parts
     _, frame, path = min(paths, key=lambda one: pixels_of(masks, one[1]))
     load, size = image_parts(path, mirrored=True)
-    parts = replace(parts, load_image=load, image_size=size, beside=beside)
+    parts = replace(parts, load_image=load, image_size=size)
     person, share = masks.get(frame), pixels_of(masks, frame) / (SIZE[0] * SIZE[1])
     if person is not None:
         hidden = with_reference_people(parts.people, Instances((person,), SIZE, path.name), Path())
         parts = replace(parts, people=hidden)
     said = f"has people on {share:.1%} of it" if frame in masks else "has no mask of people"
-    note = f"the reference image is frame {frame}, the emptiest: it {said}"
-    return replace(parts, notes=(*parts.notes, note))
+    notes.append(f"the reference image is frame {frame}, the emptiest: it {said}")
+    return parts
 
 
 def _tracks(recordings: Sequence[Recording]) -> dict[str, int]:
@@ -216,51 +220,38 @@ def _joined(
     return whole
 
 
-def _with_truth(parts: Parts, lines: Sequence[Timeline], lens: At, hints: Hints) -> Parts:
-    """The parts with the folders truth/ and truth_scan/."""
-    recording = lines[0].recording
-    root, notes = recording.root, list(parts.notes)
-    if not (root / "cam2world" / f"{recording.scene}.json").is_file():
-        return parts
-    cam2world = rigid(read_json(root / "cam2world" / f"{recording.scene}.json"))
+def _truth(lines: Sequence[Timeline], lens: At, hints: Hints, notes: list[str]) -> Files:
+    """The folders truth/ and truth_scan/."""
+    recording, root = lines[0].recording, lines[0].recording.root
+    path = root / "cam2world" / f"{recording.scene}.json"
+    if not path.is_file():
+        return {}
+    cam2world = rigid(read_json(path))
     world, R = world_of(cam2world)
     camera = {**lens.value, "R_cam_world": R.tolist()}
     boxes: list[TrueBox] = []
     if hints.boxes is not None:
-        boxes = read_bbox3d(hints.boxes, hints.names, read_json(hints.boxes))
+        boxes = read_bbox3d(hints.boxes, hints.names)
     else:
         notes.append("without --boxes the truth has no furniture")
-    beside = dict(parts.beside)
-    for place, scene in _true_scenes(recording, boxes, world, cam2world, camera).items():
-        beside[f"{place}/scene.json"] = partial(write_scene, scene)
+    path = root / "scenes" / f"{recording.scene}.ply"
+    scan = read_scan(path) if path.is_file() else None
+    ground = None if scan is None else floor_in(scan, world)
+    there = world @ cam2world, camera, ground  # boxes are in the camera's frame
+    scenes = {"truth": boxes_scene(boxes, *there)}
+    if scan is not None and boxes:
+        back = np.linalg.inv(cam2world)
+        verts = scan.verts.double().numpy() @ back[:3, :3].T + back[:3, 3]
+        seen = replace(scan, verts=torch.from_numpy(verts).float())
+        scenes["truth_scan"] = boxes_scene(boxes, *there, seen)
+    files: Files = {f"{place}/scene.json": partial(write_scene, s) for place, s in scenes.items()}
     if recording.scene == QUANTITATIVE:
         true = [(line, _fits(line, ("mosh",), notes)) for line in lines]
         mosh = _joined(true, _tracks([line.recording for line in lines]), notes)
         if mosh is not None:
             true_bodies = _into_camera(mosh, root, cam2world)
-            beside["truth/bodies.npz"] = partial(write_bodies, true_bodies)
-    return replace(parts, notes=tuple(notes), beside=beside)
-
-
-def _true_scenes(
-    recording: Recording,
-    boxes: list[TrueBox],
-    world: Matrix,
-    cam2world: Matrix,
-    camera: dict[str, Any],
-) -> dict[str, Scene]:
-    """The boxes, and the scan's parts in them; the boxes are in the camera's frame."""
-    path = recording.root / "scenes" / f"{recording.scene}.ply"
-    scan = read_scan(path) if path.is_file() else None
-    ground = None if scan is None else floor_in(scan, world)
-    from_camera = world @ cam2world
-    scenes = {"truth": boxes_scene(boxes, from_camera, camera, ground)}
-    if scan is not None and boxes:
-        back = np.linalg.inv(cam2world)
-        verts = scan.verts.double().numpy() @ back[:3, :3].T + back[:3, 3]
-        seen = replace(scan, verts=torch.from_numpy(verts).float())
-        scenes["truth_scan"] = boxes_scene(boxes, from_camera, camera, ground, seen)
-    return scenes
+            files["truth/bodies.npz"] = partial(write_bodies, true_bodies)
+    return files
 
 
 def _into_camera(bodies: Bodies, root: Path, cam2world: Matrix) -> Bodies:

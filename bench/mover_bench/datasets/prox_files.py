@@ -91,7 +91,6 @@ FOLDERS = {
     **{kind: f"{kind}/{{}}/results" for kind in FITS},
 }
 """What a recording has for each of its frames, by the folder's pattern in the user's copy."""
-ENDINGS = ("_keypoints",)  # of names beside those of the pictures
 
 
 @dataclass(frozen=True)
@@ -145,8 +144,7 @@ def named_files(recording: Recording, kind: str) -> list[tuple[str, Path]]:
         name = path.name if path.is_dir() else path.stem
         if path.name.startswith(".") or not re.search(r"\d", name):
             continue
-        for ending in ENDINGS:
-            name = name.removesuffix(ending)
+        name = name.removesuffix("_keypoints")
         if name in found:
             raise InputError(f"{folder}: {found[name].name} and {path.name} are one frame")
         found[name] = path

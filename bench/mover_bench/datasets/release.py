@@ -240,7 +240,7 @@ def _truth(folder: Path, camera: dict[str, Any], hints: Hints) -> dict[str, Scen
     path = hints.boxes or found(folder, "bbox3d.json")
     if path is None:
         return {}
-    boxes = read_bbox3d(path, hints.names, read_json(path))
+    boxes = read_bbox3d(path, hints.names)
     guess = At(camera, "camera").maybe("R_cam_world")
     first = FLIP if guess is None else np.array(guess.value)
     R = level_of(vertical_of(boxes, first[:, 1]))

@@ -17,7 +17,7 @@ from mover.core.types import Mesh, Scene
 from mover.geometry.mesh import used
 from mover.io.capture.camera_file import camera_of
 from mover.io.capture.scene_file import scene_of, scene_tree
-from mover.io.files.fields import At
+from mover.io.files.fields import At, read_json
 from mover.io.files.meshes import read_mesh
 from mover.io.scenes.placing import Matrix, category_of_name, free_id, load_from
 
@@ -43,12 +43,13 @@ class TrueBox:
     axes: Matrix  #: its axes as rows, in the order of `half`
 
 
-def read_bbox3d(path: Path, names: Mapping[str, str], file: At) -> list[TrueBox]:
+def read_bbox3d(path: Path, names: Mapping[str, str]) -> list[TrueBox]:
     """The boxes of MOVER's authors: {id: {centroid, basis, coeffs}}, with half sizes.
 
     The page does not say whether the axes are the rows or the columns of `basis`: the reading in
     which the boxes agree better on what is up counts. `names` are categories by id.
     """
+    file = read_json(path)
     rows = {key: file.get(key) for key in file.mapping()}
     if not rows:
         raise InputError(f"{path.name}: has no boxes, expected {{id: {{centroid, basis, coeffs}}}}")
@@ -111,10 +112,11 @@ def boxes_scene(
     """A scene of the boxes, or of what a scan (in their frame) has inside them.
 
     `world` is our world (+y up, the camera at the origin) from the frame of the boxes (4, 4),
-    `ground` the height of the floor in it [m].
+    `ground` the height of the floor in it [m]: triangles of a scan that lie there are left out.
     """
     if scan is not None and ground is not None:
-        scan = without_floor(scan, world, ground)
+        low = torch.from_numpy(np.abs(_heights(scan, world) - ground) < FLOOR)
+        scan = dataclasses.replace(scan, faces=scan.faces[~low[scan.faces].all(1)])
     rows: list[dict[str, Any]] = []
     meshes: dict[str, tuple[Mesh, str]] = {}
     for box in boxes:
@@ -133,17 +135,9 @@ def boxes_scene(
     return scene_of(tree, load, lens, lambda _: None)[0]
 
 
-def floor_in(scan: Mesh, world: Matrix) -> float:
-    """Height of a scan's floor in our world, of which `world` is the matrix from its frame [m]."""
-    return floor_of(scan.verts.double().numpy() @ world[1, :3] + world[1, 3])
-
-
-def without_floor(scan: Mesh, world: Matrix, ground: float) -> Mesh:
-    """A scan without the triangles that lie on the floor, `ground` [m] high in our `world`."""
-    heights = scan.verts.double().numpy() @ world[1, :3] + world[1, 3] - ground
-    low: NDArray[np.bool_] = np.abs(heights) < FLOOR
-    faces = scan.faces.numpy()
-    return dataclasses.replace(scan, faces=torch.from_numpy(faces[~low[faces].all(1)]))
+def _heights(scan: Mesh, world: Matrix) -> NDArray[np.float64]:
+    """Of a scan's vertices in our world, of which `world` is the matrix from its frame [m]."""
+    return scan.verts.double().numpy() @ world[1, :3] + world[1, 3]
 
 
 def _upright(axes: Matrix) -> tuple[list[int], Matrix, float]:
@@ -179,8 +173,9 @@ def read_scan(path: Path) -> Mesh:
     return read_mesh(At(path.name, path.name), path.parent)[0]
 
 
-def floor_of(heights: NDArray[np.float64]) -> float:
-    """The height at which a scan has its lowest large level part, of its vertices' heights [m]."""
+def floor_in(scan: Mesh, world: Matrix) -> float:
+    """Height of a scan's lowest large level part in our world, as `_heights` has it [m]."""
+    heights = _heights(scan, world)
     lowest = float(np.quantile(heights, OUTLIERS))
     near = heights[(heights >= lowest - BIN) & (heights <= lowest + REACH)]
     edges = np.arange(lowest - BIN, lowest + REACH + BIN, BIN)

@@ -1,16 +1,21 @@
-"""The variants of an experiment on the known room of one seed.
+"""Run an experiment: known rooms beside each other, each with all variants.
 
 A process a room (`python -m mover_bench.experiment.job SET SEED OUT VARIANT ...`) with one
-thread. Variants share their finished stages; what is finished is a file OUT/SET/SEED/VARIANT.json,
-and a variant that fails leaves its traceback there.
+thread. Variants share their finished stages; what is finished is a file OUT/SET/SEED/VARIANT.json
+and is not done again; a variant that fails leaves its traceback there.
 """
 
 import json
+import os
 import shutil
+import subprocess
 import sys
+import time
 import traceback
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -19,19 +24,54 @@ import torch
 from mover import __version__
 from mover.app.batch import read_tree
 from mover.core import records
+from mover.core.errors import InputError
 from mover.core.files import replacing
+from mover.core.observe import Observer, Step, silent
 from mover.core.run import Run, sources
 from mover.evaluate.bodies import shared_rows
 from mover.extensions import reconstruct
 from mover.stages.config import RefineBodiesConfig
 from mover.stages.people.refine_bodies import refine_bodies
+from mover_bench.cli import ExperimentArgs
 from mover_bench.experiment.measures import Judge, Trial, under_camera
-from mover_bench.experiment.sets import RoomSet, changed, set_named
-from mover_bench.experiment.variants import VARIANTS, Variant, withheld
+from mover_bench.experiment.sets import RoomSet, changed, parse_seeds, set_named
+from mover_bench.experiment.tables import LOG, path_of, write_tables
+from mover_bench.experiment.variants import VARIANTS, Variant, names_in, withheld
 from mover_bench.rooms.camera_path import filmed
 from mover_bench.rooms.known import KnownRoom, make_room
 from mover_bench.rooms.moved import make_moved_room
 from mover_bench.rooms.noise import without_seat
+
+Jobs = Sequence[tuple[Sequence[str], Path]]  #: the words of each, and the file of what it says
+Pool = Callable[[str, Jobs, int], Iterator[int]]  #: `run_each`, or what does the same another way
+LOOK = 0.05  # [s] between two looks at which jobs have ended
+THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+
+def run_each(module: str, jobs: Jobs, workers: int) -> Iterator[int]:
+    """Run `python -m MODULE WORDS` for each job; yield its index when it has ended.
+
+    So many `workers` run at once; 0: as many as there are cores.
+    """
+    waiting, running = deque(enumerate(jobs)), dict[int, subprocess.Popen[bytes]]()
+    try:
+        while waiting or running:
+            while waiting and len(running) < (workers or os.cpu_count() or 1):
+                index, (words, log) = waiting.popleft()
+                log.parent.mkdir(parents=True, exist_ok=True)
+                command = [sys.executable, "-m", module, *words]
+                with log.open("w") as file:
+                    running[index] = subprocess.Popen(
+                        command, stdout=file, stderr=file, env=os.environ | THREADS
+                    )
+            time.sleep(LOOK)
+            for index in [k for k, job in running.items() if job.poll() is not None]:
+                del running[index]
+                yield index
+    finally:  # where the user stops, what runs is ended
+        for job in running.values():
+            job.terminate()
+            job.wait()
 
 
 def true_room(seed: int, rooms: RoomSet) -> KnownRoom:
@@ -42,6 +82,12 @@ def true_room(seed: int, rooms: RoomSet) -> KnownRoom:
 def noisy_room(seed: int, rooms: RoomSet) -> Trial:
     """A generated room of a set, with the noise of the set."""
     return with_noise(true_room(seed, rooms), seed, rooms)
+
+
+def room_named(name: str) -> Trial:
+    """The noisy room SET:SEED."""
+    kind, seed = name.split(":")
+    return noisy_room(int(seed), set_named(kind))
 
 
 def with_noise(room: KnownRoom, seed: int, rooms: RoomSet) -> Trial:
@@ -62,11 +108,6 @@ def key_of(rooms: RoomSet, seed: int, variant: Variant) -> str:
     """Digest of everything that the numbers of a variant depend on."""
     made = rooms.room, rooms.noise, rooms.withheld, rooms.paths
     return records.fingerprint(*made, seed, variant, sources("mover_bench"))
-
-
-def path_of(out: Path, rooms: str, seed: int, name: str) -> Path:
-    """The file of a variant's numbers."""
-    return out / rooms / str(seed) / f"{name}.json"
 
 
 def is_finished(out: Path, rooms: str, seed: int, name: str) -> bool:
@@ -107,6 +148,29 @@ def do_room(out: Path, rooms: str, seed: int, names: Sequence[str]) -> None:
             with replacing(path_of(out, rooms, seed, name)) as part:
                 part.write_text(json.dumps(about | numbers, indent=1, allow_nan=False))
     shutil.rmtree(folder / "stages", ignore_errors=True)
+
+
+def run_experiment(args: ExperimentArgs, observe: Observer = silent, pool: Pool = run_each) -> Path:
+    """Do all that is not finished, then write the tables; the summary, OUT/SET/summary.md.
+
+    Raises:
+        InputError: If a seed, a variant or a set is none, or pandas is not installed.
+    """
+    if find_spec("pandas") is None:
+        raise InputError("pandas is not installed; pip install -e '.[bench]' in mover's folder")
+    seeds, names = parse_seeds(args.seeds), names_in(args.variants)
+    set_named(args.set)
+    open_seeds = [
+        seed for seed in seeds if not all(is_finished(args.out, args.set, seed, n) for n in names)
+    ]
+    jobs = [
+        ((args.set, str(seed), str(args.out), *names), args.out / args.set / str(seed) / LOG)
+        for seed in open_seeds
+    ]
+    ended = pool("mover_bench.experiment.job", jobs, args.workers)
+    for done, index in enumerate(ended, len(seeds) - len(jobs)):
+        observe(Step(f"{args.set} {open_seeds[index]}", done, len(seeds)))
+    return write_tables(args, seeds, names)
 
 
 def main(arguments: Sequence[str]) -> None:

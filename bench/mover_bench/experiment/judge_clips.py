@@ -21,8 +21,9 @@ from mover.bodies.parts import BodyParts, members, parts_of
 from mover.bodies.posture import postures
 from mover.bodies.skinning import heights_of, open_body
 from mover.core.errors import InputError
-from mover.core.observe import Observer, Step, silent
+from mover.core.observe import Observer, silent
 from mover.core.types import Bodies, Scene, SceneObject
+from mover.evaluate.bodies import shared_rows
 from mover.furniture.library import SEATS, STANDARD, canonical
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import project, to_camera
@@ -35,7 +36,7 @@ from mover.io.people.keypoints import read_keypoints
 from mover.perceive.capture import read_picture_of
 from mover.perceive.layout import Picture
 from mover_bench.cli import ExperimentArgs
-from mover_bench.experiment.tables import markdown, write_summary
+from mover_bench.experiment.tables import judge_each, markdown
 
 VIEW = 65.0  # [degrees], horizontal, of a clip whose lens was not measured
 STEP_UP = 0.15  # [m] that a seat may reach into its sitter and still be below
@@ -60,15 +61,16 @@ def judge_clips(args: ExperimentArgs, observe: Observer = silent) -> Path:
     clips = sorted(p.parent for p in source.glob("*/video.mp4") if args.source)
     if not clips:
         raise InputError("--source: expected a folder of clips, CLIP/video.mp4 and furniture.json")
-    out, found = args.out / "clips", dict[str, dict[str, Any]]()
-    for done, clip in enumerate(clips):
-        observe(Step(f"clips {clip.name}", done, len(clips)))
+    out = args.out / "clips"
+
+    def judge(clip: Path) -> dict[str, Any]:
         video_to_room(VideoArgs(
             clip / "video.mp4", out / clip.name, keypoints="mediapipe", fov=VIEW,
             objects=clip / "furniture.json", preset=args.variants[0],
         ))  # fmt: skip
-        found[clip.name] = judge_room(out / clip.name)
-    return write_summary(out, found, table_of(found))
+        return judge_room(out / clip.name)
+
+    return judge_each(clips, judge, table_of, out, observe)
 
 
 def table_of(found: dict[str, dict[str, Any]]) -> str:
@@ -166,13 +168,9 @@ def miss_of(capture: Path, stature: float) -> float | None:
         return None
     K = read_picture_of(capture).camera.K
     places = keypoints_of(open_body(), bodies.verts, bodies.joints, joints.layout)
-    seen = zip(joints.frame.tolist(), joints.person.tolist(), strict=True)
-    keys = {key: k for k, key in enumerate(seen)}
-    misses = list[Tensor]()
-    for row, key in enumerate(zip(bodies.frame.tolist(), bodies.person.tolist(), strict=True)):
-        if key in keys:
-            sure = (joints.confidence[keys[key]] > SURE) & places[row].isfinite().all(-1)
-            off = project(places[row], K) - joints.points[keys[key]]
-            tall = stature * K[1, 1] / bodies.verts[row, :, 2].mean()
-            misses.append(off[sure].norm(dim=-1) / tall)
-    return round(100 * float(torch.cat(misses).mean()), 1) if misses else None
+    rows, seen = shared_rows(bodies, joints)
+    sure = (joints.confidence[seen] > SURE) & places[rows].isfinite().all(-1)
+    off = (project(places[rows], K) - joints.points[seen]).norm(dim=-1)
+    tall = stature * K[1, 1] / bodies.verts[rows, :, 2].mean(-1, keepdim=True)
+    misses = (off / tall)[sure]
+    return round(100 * float(misses.mean()), 1) if len(misses) else None

@@ -12,9 +12,9 @@ import torch
 from mover.bodies.corrected import statures
 from mover.bodies.skinning import open_body
 from mover.core.errors import InputError
-from mover.core.observe import Observer, Step, silent
+from mover.core.observe import Observer, silent
 from mover.core.run import Run
-from mover.core.types import Bodies, Camera, Capture, Scene, SceneObject
+from mover.core.types import Bodies, Camera, Capture, Detection, Scene, SceneObject
 from mover.evaluate.scene import Pair, Together, iou3d, iou3d_aligned
 from mover.fitting.bodies import FitInputs, fit_bodies
 from mover.geometry.camera import pitch_roll, tilted
@@ -27,7 +27,7 @@ from mover.pipeline.presets import PRESETS
 from mover.pipeline.reconstruct import reconstruct
 from mover_bench.cli import ExperimentArgs
 from mover_bench.datasets.i3db import I3dbScene, read_i3db
-from mover_bench.experiment.tables import markdown, write_summary
+from mover_bench.experiment.tables import judge_each, markdown
 
 LEVEL = tilted(torch.tensor(0.0), torch.tensor(0.0))
 POINTS = 1  # of surfaces, which are not compared
@@ -51,11 +51,12 @@ def judge_i3db(args: ExperimentArgs, observe: Observer = silent) -> Path:
     if not folders:
         raise InputError(f"{args.source}: has no scene of i3DB, expected folders like Scene04/gt")
     torch.set_num_threads(1)
-    out, found = args.out / "i3db", dict[str, dict[str, Any]]()
-    for done, folder in enumerate(folders):
-        observe(Step(f"i3db {folder.name}", done, len(folders)))
-        found[folder.name] = judge_scene(read_i3db(folder), Run(out / folder.name), preset)
-    return write_summary(out, found, table_of(found))
+    out = args.out / "i3db"
+
+    def judge(folder: Path) -> dict[str, Any]:
+        return judge_scene(read_i3db(folder), Run(out / folder.name), preset)
+
+    return judge_each(folders, judge, table_of, out, observe)
 
 
 COLUMNS = {
@@ -81,7 +82,9 @@ def judge_scene(scene: I3dbScene, run: Run, preset: str) -> dict[str, Any]:
     bodies = fit_bodies(FitInputs(scene.keypoints, camera, model)).bodies
     tall = None if bodies.pose is None else statures(bodies.pose)
     assert tall is not None, "of the open body"
-    first = first_scene(seen_from(picture_of(scene, camera), bodies, run), LayoutConfig(), run)
+    first = first_scene(
+        seen_from(picture_of(scene.detections, camera), bodies, run), LayoutConfig(), run
+    )
     numbers: dict[str, Any] = {
         "stature": float(tall[0]),
         **overlaps("first", first.scene.objects, scene),
@@ -96,11 +99,11 @@ def judge_scene(scene: I3dbScene, run: Run, preset: str) -> dict[str, Any]:
     return numbers
 
 
-def picture_of(scene: I3dbScene, camera: Camera) -> Picture:
-    """What the one picture shows: the masks of the furniture."""
-    masks = [decode(found.mask, 0) for found in scene.detections if found.mask is not None]
-    no_people = torch.zeros(camera.height, camera.width, dtype=torch.bool)
-    return Picture(camera, scene.detections, torch.stack(masks), no_people, None, None)
+def picture_of(detections: tuple[Detection, ...], camera: Camera) -> Picture:
+    """What a picture without people shows: the masks of the furniture."""
+    blank = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    masks = [blank if found.mask is None else decode(found.mask, 0) for found in detections]
+    return Picture(camera, detections, torch.stack(masks), blank, None, None)
 
 
 def capture_of(scene: I3dbScene, start: Scene, bodies: Bodies) -> Capture:

@@ -9,7 +9,7 @@ import json
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +22,11 @@ from mover.core.records import fingerprint
 from mover.core.run import Run, sources
 from mover.core.types import Bodies, Capture, Scene, SceneObject
 from mover.evaluate.bodies import shared_rows
-from mover.evaluate.evaluation import EvaluateConfig, EvaluatedBodies, evaluate
+from mover.evaluate.evaluation import EvaluateConfig, EvaluatedBodies, evaluate, read_truth
 from mover.extensions import reconstruct
 from mover.io.capture.bodies_file import read_bodies, write_bodies
-from mover.io.capture.camera_file import camera_of
 from mover.io.capture.folder import read_capture
 from mover.io.capture.scene_file import read_scene
-from mover.io.files.fields import read_json
 from mover.pipeline.result import to_world
 from mover.stages.config import RefineBodiesConfig
 from mover.stages.people.refine_bodies import ABLATION, refine_bodies
@@ -57,8 +55,7 @@ class TableJob:
     @property
     def words(self) -> tuple[str, ...]:
         """The command line of its process."""
-        return (str(self.capture), str(self.out), self.preset, self.name, str(self.steps),
-                self.device, self.vposer)  # fmt: skip
+        return tuple(map(str, astuple(self)))
 
     @staticmethod
     def of(words: Sequence[str]) -> "TableJob":
@@ -179,18 +176,15 @@ def measure(
         path = folder / name
         if not (path / "scene.json").is_file():
             continue
-        own = path / "camera.json"
-        camera = camera_of(read_json(own)) if own.exists() else None
-        true = read_scene(path / "scene.json", camera)
         there = path / "bodies.npz"
-        true_people = read_bodies(there) if there.is_file() else None
-        rows = EvaluatedBodies(None, people, true_people, named=named_contacts(capture, people))
-        if name == "truth_scan":
-            rows = EvaluatedBodies(None, None, None)
-        values = evaluate(capture.scene, scene, true, rows, BOXES, ("result",))["result"]
+        rows = None  # the scan is for the furniture alone
         if name == "truth":
-            values.pop("p2s", None)  # of boxes: their walls are no furniture
-            found |= values
+            true_people = read_bodies(there) if there.is_file() else None
+            rows = EvaluatedBodies(None, people, true_people, named_contacts(capture, people))
+        true = read_truth(path)
+        values = evaluate(capture.scene, scene, true, rows, BOXES, ("result",))["result"]
+        if name == "truth":  # of boxes: their walls are no furniture
+            found = {key: value for key, value in values.items() if key != "p2s"}
         elif "p2s" in values:
             found["p2s"] = values["p2s"]
     return found

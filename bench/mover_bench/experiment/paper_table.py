@@ -19,6 +19,7 @@ from mover.energy.config import Adam
 from mover.pipeline.presets import PRESETS
 from mover_bench.cli import TableArgs
 from mover_bench.datasets import prox_files
+from mover_bench.experiment.job import Pool, run_each
 from mover_bench.experiment.paper_job import DONE, TableJob, fits_of, key_of
 from mover_bench.experiment.paper_rows import (
     BASELINE,
@@ -33,7 +34,6 @@ from mover_bench.experiment.paper_rows import (
     TableRow,
     variants,
 )
-from mover_bench.experiment.run import Pool, run_each
 from mover_bench.experiment.tables import LOG, markdown
 
 MILLIMETRES = 1000.0

@@ -3,7 +3,7 @@
 import json
 import os
 import platform
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,10 +15,10 @@ from jaxtyping import Float
 from mover.app.batch import last_line, read_tree
 from mover.app.report.tables import SHOWN, shown
 from mover.core.files import replacing
+from mover.core.observe import Observer, Step
 from mover.core.records import plain
 from mover.evaluate.evaluation import METRICS
 from mover_bench.cli import ExperimentArgs
-from mover_bench.experiment.job import path_of
 from mover_bench.experiment.sets import set_named
 from mover_bench.experiment.variants import VARIANTS
 
@@ -49,12 +49,26 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(row) + " |" for row in (head, rule, *rows))
 
 
-def write_summary(folder: Path, found: Mapping[str, Any], text: str) -> Path:
-    """Write summary.json and summary.md of a set of real data; returns the latter."""
-    for name, content in (("summary.json", json.dumps(found, indent=1)), ("summary.md", text)):
-        with replacing(folder / name) as part:
-            part.write_text(content)
-    return folder / "summary.md"
+Numbers = dict[str, Any]
+
+
+def judge_each(
+    folders: Sequence[Path],
+    judge: Callable[[Path], Numbers],
+    table: Callable[[dict[str, Numbers]], str],
+    out: Path,
+    observe: Observer,
+) -> Path:
+    """Judge the folders of a set of real data; write summary.json and, returned, summary.md."""
+    found: dict[str, Numbers] = {}
+    for done, folder in enumerate(folders):
+        observe(Step(f"{out.name} {folder.name}", done, len(folders)))
+        found[folder.name] = judge(folder)
+    texts = {"summary.json": json.dumps(found, indent=1), "summary.md": table(found)}
+    for name, text in texts.items():
+        with replacing(out / name) as part:
+            part.write_text(text)
+    return out / "summary.md"
 
 
 class Interval(NamedTuple):
@@ -78,6 +92,11 @@ def interval(values: Sequence[float] | Float[np.ndarray, " rooms"], seed: int = 
     drawn = data[np.random.default_rng(seed).integers(0, len(data), (RESAMPLES, len(data)))]
     low, high = np.quantile(drawn.mean(1), [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     return Interval(float(data.mean()), float(low), float(high), len(data))
+
+
+def path_of(out: Path, rooms: str, seed: int, name: str) -> Path:
+    """The file of a variant's numbers."""
+    return out / rooms / str(seed) / f"{name}.json"
 
 
 @dataclass(frozen=True)
@@ -119,9 +138,9 @@ def read_finished(out: Path, rooms: str, seeds: Sequence[int], names: Sequence[s
     return Finished(rows, things, lacking, tuple(sorted(versions)))
 
 
-def write_tables(args: ExperimentArgs, names: Sequence[str], found: Finished) -> Path:
+def write_tables(args: ExperimentArgs, seeds: Sequence[int], names: Sequence[str]) -> Path:
     """Write results.csv, summary.csv and summary.md into OUT/SET; returns the latter."""
-    folder = args.out / args.set
+    folder, found = args.out / args.set, read_finished(args.out, args.set, seeds, names)
     for name, frame in (("results.csv", found.objects), ("summary.csv", found.scenes)):
         with replacing(folder / name) as part:
             frame.to_csv(part, index=False, float_format="%.6g", lineterminator="\n")

@@ -12,14 +12,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mover.core.records import map_tensors
 from mover.core.types import CameraPath, Capture
 from mover.geometry.path import from_reference, is_still, poses_at, scaled
 from mover.geometry.raster import first_hit
 from mover.geometry.rotations import axis_angle
 from mover.io.capture.pose_file import moved
 from mover_bench.rooms.config import NoiseConfig, PathConfig
-from mover_bench.rooms.known import KnownRoom, one_thread, rounded, visible
+from mover_bench.rooms.known import KnownRoom, one_thread, rounded_bodies, visible
 from mover_bench.rooms.noise import add_noise, slow
 from mover_bench.rooms.render import furniture
 
@@ -93,12 +92,10 @@ def on_the_way(room: KnownRoom, path: CameraPath) -> KnownRoom:
     back = poses.R_reference_camera.mT, poses.t_reference_camera
     shift = -(back[0] @ back[1][..., None])[..., 0]
     assert bodies.joints is not None, "a known room has joints"
-    seen = replace(
-        bodies,
-        verts=rounded(from_reference(bodies.verts, poses)),
-        joints=rounded(from_reference(bodies.joints, poses)),
-        pose=map_tensors(rounded, moved(bodies.pose, back[0], shift)),
-    )
+    seen = rounded_bodies(replace(
+        bodies, verts=from_reference(bodies.verts, poses),
+        joints=from_reference(bodies.joints, poses), pose=moved(bodies.pose, back[0], shift),
+    ))  # fmt: skip
     camera, (verts, faces, _) = room.truth.camera, furniture(room.plan)
     still = room.plan.view.seen(verts)[None]
 

@@ -17,16 +17,16 @@ from mover.core.types import Camera
 from mover.furniture.library import make_piece
 from mover.geometry.camera import project, tilted, to_camera
 from mover.geometry.raster import first_hit
-from mover_bench.rooms.config import PlanConfig, Rule
+from mover_bench.rooms.config import PlanConfig, RoomConfig, Rule
 from mover_bench.rooms.placed import Placed, corners, on_floor, verts_on_floor
 from mover_bench.rooms.turns import facing, heading_of
 
 Pose = tuple[float, float, float]
 Size = tuple[float, float, float]
-Others = list[Placed]
+Random = np.random.Generator
 
 
-def _wall(rng: np.random.Generator, size: Size, walls: np.ndarray, _: Others) -> Pose:
+def _wall(rng: Random, size: Size, walls: np.ndarray) -> Pose:
     side = int(rng.integers(3))
     off = size[2] / 2 + float(rng.uniform(0.02, 0.06))
     half = size[0] / 2 + 0.02
@@ -37,19 +37,19 @@ def _wall(rng: np.random.Generator, size: Size, walls: np.ndarray, _: Others) ->
     return (walls[0, 0] + off if side == 1 else walls[1, 0] - off), z, turn
 
 
-def _corner(rng: np.random.Generator, size: Size, walls: np.ndarray, _: Others) -> Pose:
+def _corner(rng: Random, size: Size, walls: np.ndarray) -> Pose:
     off = max(size[0], size[2]) / 2 + float(rng.uniform(0.03, 0.5))
     x = walls[0, 0] + off if rng.integers(2) else walls[1, 0] - off
     return float(x), float(walls[0, 1] + off), float(rng.uniform(-np.pi, np.pi))
 
 
-def _middle(rng: np.random.Generator, _: Size, walls: np.ndarray, __: Others) -> Pose:
+def _middle(rng: Random, _: Size, walls: np.ndarray) -> Pose:
     x = float(rng.uniform(-1.4, 1.4))
     z = float(rng.uniform(walls[0, 1] + 1.6, -3.1))
     return x, z, float(rng.choice([0.0, np.pi / 2]) + np.radians(rng.uniform(-8, 8)))
 
 
-def _facing(rng: np.random.Generator, _: Size, walls: np.ndarray, __: Others) -> Pose:
+def _facing(rng: Random, _: Size, walls: np.ndarray) -> Pose:
     x = float(rng.uniform(walls[0, 0] + 0.6, walls[1, 0] - 0.6))
     z = float(rng.uniform(walls[0, 1] + 0.6, -2.7))
     centre = np.array([0.0, (walls[0, 1] - 2.8) / 2])
@@ -57,23 +57,13 @@ def _facing(rng: np.random.Generator, _: Size, walls: np.ndarray, __: Others) ->
     return x, z, heading
 
 
-def _first(others: Others, category: str) -> Placed | None:
-    return next((p for p in others if p.furniture.category == category), None)
-
-
-def _before(rng: np.random.Generator, size: Size, _: np.ndarray, others: Others) -> Pose | None:
-    sofa = _first(others, "sofa")
-    if sofa is None:
-        return None
+def _before(rng: Random, size: Size, sofa: Placed) -> Pose:
     away = sofa.furniture.size[2] / 2 + size[2] / 2 + float(rng.uniform(0.8, 1.0))
     x, z = sofa.place + away * sofa.axes[1]
     return float(x), float(z), sofa.heading
 
 
-def _around(rng: np.random.Generator, size: Size, _: np.ndarray, others: Others) -> Pose | None:
-    table = _first(others, "table")
-    if table is None:
-        return None
+def _around(rng: Random, size: Size, table: Placed) -> Pose:
     side = int(rng.integers(4))
     w, d = table.furniture.size[0], table.furniture.size[2]
     away = (d if side % 2 == 0 else w) / 2 + size[2] / 2 + float(rng.uniform(0.06, 0.45))
@@ -83,21 +73,32 @@ def _around(rng: np.random.Generator, size: Size, _: np.ndarray, others: Others)
     return float(x), float(z), float(out + turn)
 
 
-def _beside(rng: np.random.Generator, size: Size, _: np.ndarray, others: Others) -> Pose | None:
-    bed = _first(others, "bed")
-    if bed is None:
-        return None
+def _beside(rng: Random, size: Size, bed: Placed) -> Pose:
     side = 1 if rng.integers(2) else -1
     across = side * (bed.furniture.size[0] / 2 + size[0] / 2 + float(rng.uniform(0.06, 0.12)))
     x, z = on_floor(bed, across, -bed.furniture.size[2] / 2 + size[2] / 2)
     return float(x), float(z), bed.heading
 
 
-RULES: dict[Rule, Callable[[np.random.Generator, Size, np.ndarray, Others], Pose | None]] = {
-    "wall": _wall, "corner": _corner, "middle": _middle, "facing": _facing, "before": _before,
-    "around": _around, "beside": _beside,
+IN_ROOM: dict[Rule, Callable[[Random, Size, np.ndarray], Pose]] = {
+    "wall": _wall, "corner": _corner, "middle": _middle, "facing": _facing,
 }  # fmt: skip
-"""Draws (x [m], z [m], heading [rad]) of a piece of a size among others; None: nowhere."""
+"""Draws (x [m], z [m], heading [rad]) of a piece of a size between walls,"""
+BY_ANOTHER: dict[Rule, tuple[str, Callable[[Random, Size, Placed], Pose]]] = {
+    "before": ("sofa", _before), "around": ("table", _around), "beside": ("bed", _beside),
+}  # fmt: skip
+"""and by the first piece of a category."""
+
+
+def _drawn(
+    rule: Rule, rng: Random, size: Size, walls: np.ndarray, others: list[Placed]
+) -> Pose | None:
+    """A pose by a rule; None: there is no piece of the category."""
+    if rule in IN_ROOM:
+        return IN_ROOM[rule](rng, size, walls)
+    category, draw = BY_ANOTHER[rule]
+    other = next((p for p in others if p.furniture.category == category), None)
+    return None if other is None else draw(rng, size, other)
 
 
 WIDTH = 240  # [px] of the small picture
@@ -207,48 +208,34 @@ def draw_view(rng: np.random.Generator, size: tuple[int, int], config: PlanConfi
     return make_view(size, height, float(pitch), float(roll), float(fov))
 
 
-def draw_plan(
-    rng: np.random.Generator,
-    size: tuple[int, int],
-    most: int,
-    least: int,
-    config: PlanConfig | None = None,
-) -> Plan:
-    """A room of a random kind, many of whose objects are partly occluded.
-
-    At most `most` objects stand in it, each of which shows at least `least` pixels of the image.
-    """
-    config = config or PlanConfig()
+def draw_plan(rng: np.random.Generator, config: RoomConfig) -> Plan:
+    """A room of a random kind, many of whose objects are partly occluded."""
     kind = sorted(KINDS)[int(rng.integers(len(KINDS)))]
+    wanted = (*KINDS[kind], *config.plan.more)[: config.pieces]
     best, most_hidden = None, -1.0
     for _ in range(ROUNDS):
-        wanted = (*KINDS[kind], *config.more)[:most]
-        plan, value = _furnished(rng, size, wanted, least, config)
+        plan, value = _furnished(rng, wanted, config)
         if best is None or value > most_hidden:
             best, most_hidden = plan, value
-        if most_hidden >= config.crowded * len(best.pieces):
+        if most_hidden >= config.plan.crowded * len(best.pieces):
             break
     assert best is not None, "there is at least one round"
     return best
 
 
 def _furnished(
-    rng: np.random.Generator,
-    size: tuple[int, int],
-    wanted: tuple[tuple[str, Rule], ...],
-    least: int,
-    config: PlanConfig,
+    rng: np.random.Generator, wanted: tuple[tuple[str, Rule], ...], config: RoomConfig
 ) -> tuple[Plan, float]:
     """One room, and how many of its objects are well occluded."""
-    view = draw_view(rng, size, config)
+    view = draw_view(rng, (config.width, config.height), config.plan)
     wide, deep = float(rng.uniform(4.6, 5.4)), float(rng.uniform(5.6, 6.4))  # of the floor [m]
     plan, value = Plan((), view, (-wide / 2, -deep), (wide / 2, -1.9)), 0.0
-    few = SPARE * least * (WIDTH / size[0]) ** 2
+    few = SPARE * config.least_pixels * (WIDTH / config.width) ** 2
     drawn: list[Float[Tensor, "h w"]] = []
     for name, rule in wanted:
-        spots = _spots(plan, name, rule, rng, config)
+        spots = _spots(plan, name, rule, rng, config.plan)
         looks = [depth_of(spot, view) for spot in spots]
-        values = [worth([*drawn, look], few, config.hidden) for look in looks]
+        values = [worth([*drawn, look], few, config.plan.hidden) for look in looks]
         best = int(np.argmax(values)) if values else -1
         if best >= 0 and values[best] >= 0:
             drawn, value = [*drawn, looks[best]], values[best]
@@ -266,7 +253,7 @@ def _spots(
     label = f"{furniture.category.replace(' ', '_')}_{count}"
     found: list[Placed] = []
     for _ in range(TRIES):
-        spot = RULES[rule](rng, furniture.size, plan.walls, others)
+        spot = _drawn(rule, rng, furniture.size, plan.walls, others)
         if spot is None or len(found) == CHOICES:
             break
         turn = 0.0

@@ -65,6 +65,11 @@ class KnownRoom:
     whole: Int[Tensor, " bodies"]  #: pixels that each body would fill if nothing occluded it
 
 
+def rounded_bodies(bodies: Bodies) -> Bodies:
+    """Positions and parameters so that the last bits of other machines do not show."""
+    return map_tensors(lambda x: rounded(x) if x.is_floating_point() else x, bodies)
+
+
 class RefusedError(Exception):
     """A draft of a room is not true enough or not rich enough."""
 
@@ -113,12 +118,10 @@ def build(
     distance = torch.cat([torch.from_numpy(n.distance).float() for n in nears])[index]
     nearest = torch.cat([torch.from_numpy(n.nearest) for n in nears])[index]
     touching = distance < GAPE
-    bodies = Bodies(
-        verts=rounded(verts), faces=model.faces, joints=rounded(joints),
-        joint_names=model.joint_names, frame=torch.tensor([f for f, _ in rows]),
-        person=torch.tensor([k for _, k in rows]), fps=config.fps, space="camera",
-        pose=map_tensors(rounded, pose),
-    )  # fmt: skip
+    frame, person = torch.tensor(rows).unbind(1)
+    bodies = rounded_bodies(Bodies(
+        verts, model.faces, joints, model.joint_names, frame, person, config.fps, "camera", pose
+    ))  # fmt: skip
     scene = scene_of(plan)
     shown = visible(plan, bodies, lambda _: sight.depth)
     capture = Capture(
@@ -137,17 +140,16 @@ def build(
 
 def scene_of(plan: Plan) -> Scene:
     """The furniture in the world of the camera."""
-    objects = []
-    for index, piece in enumerate(plan.pieces):
-        x, z = piece.place.tolist()
-        t = torch.tensor([x, -plan.view.height, z])
-        objects.append(
-            SceneObject(
-                piece.id, piece.furniture.category, piece.furniture.mesh, "", index + 1,
-                "ground", t, torch.tensor(float(piece.heading)), torch.ones(3),
-            )
-        )  # fmt: skip
-    return Scene(plan.view.camera, -plan.view.height, tuple(objects))
+    ground = -plan.view.height
+    objects = tuple(
+        SceneObject(
+            piece.id, piece.furniture.category, piece.furniture.mesh, "", index, "ground",
+            torch.tensor([float(piece.at[0]), ground, float(piece.at[1])]),
+            torch.tensor(float(piece.heading)), torch.ones(3),
+        )
+        for index, piece in enumerate(plan.pieces, 1)
+    )  # fmt: skip
+    return Scene(plan.view.camera, ground, objects)
 
 
 def _detections(plan: Plan, sight: Sight, config: RoomConfig) -> tuple[Detection, ...]:
@@ -219,14 +221,14 @@ def free_place(plan: Plan, rng: np.random.Generator) -> np.ndarray:
     """A place to stand with room around it, in view of the camera (x, z) [m].
 
     Raises:
-        ValueError: If there is none.
+        RefusedError: If there is none.
     """
     low, high = plan.walls[0] + 0.45, np.array([plan.walls[1, 0] - 0.45, -2.9])
     for _ in range(200):
         place = rng.uniform(low, high)
         if abs(place[0]) < 0.5 * -place[1] and free_of(place, plan.pieces, ROOMY):
             return place
-    raise ValueError("the room has no free floor")
+    raise RefusedError("the room has no free floor")
 
 
 def draw_tasks(
@@ -292,8 +294,7 @@ def make_room(seed: int, config: RoomConfig | None = None) -> KnownRoom:
     for draft in range(60):
         rng = np.random.default_rng([seed, draft])
         try:
-            size = (config.width, config.height)
-            plan = draw_plan(rng, size, config.pieces, config.least_pixels, config.plan)
+            plan = draw_plan(rng, config)
             actors = cast(plan, config, rng, refused)
             return build(plan, actors, config, f"room_{seed}", tuple(refused))
         except RefusedError as error:
@@ -327,10 +328,7 @@ def _actor(plan: Plan, config: RoomConfig, rng: np.random.Generator) -> Actor:
     bounds = np.stack([plan.walls[0] + 0.25, plan.walls[1] - 0.25])
     adult = [float(b) for b in np.clip(rng.normal(0, 0.7, 4), -1.4, 1.4)] + [0.0] * 6
     stage = Stage(make_person(adult), plan.pieces, bounds, config.fps)
-    try:
-        tasks, place = draw_tasks(plan, rng, config.stay, config.acts), free_place(plan, rng)
-    except ValueError as error:
-        raise RefusedError(str(error)) from error
+    tasks, place = draw_tasks(plan, rng, config.stay, config.acts), free_place(plan, rng)
     start = Stop(place, float(rng.uniform(-np.pi, np.pi)), place)
     return Actor(stage, perform(stage, tasks, start, rng, config.most_frames))
 

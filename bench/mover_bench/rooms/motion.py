@@ -89,7 +89,7 @@ def perform(
         try:
             stop = stop_for(stage, task, here)
             new = _played(stage, task, here, stop, phase)
-        except (NoWayError, RefusedTaskError, ValueError) as error:
+        except (NoWayError, ValueError) as error:
             name = stage.pieces[task.piece].id if task.piece >= 0 else "to a place"
             refused.append(f"{task.kind} {name}: {error}")
         else:
@@ -100,10 +100,6 @@ def perform(
     labels = tuple(t.label for t, n in zip(takes, count, strict=True) for _ in range(n))
     touched = tuple(t.piece for t, n in zip(takes, count, strict=True) for _ in range(n))
     return Performance(chain([t.posture for t in takes]), labels, touched, tuple(refused))
-
-
-class RefusedTaskError(Exception):
-    """Bodies would sink into furniture, or hang in the air."""
 
 
 def _played(stage: Stage, task: Task, here: Stop, stop: Stop, phase: float) -> list[Take]:
@@ -123,7 +119,7 @@ def _check(stage: Stage, takes: list[Take]) -> None:
 
     found = [fault for faulty in mapped(wrong, takes) for fault in faulty]
     if found:
-        raise RefusedTaskError(found[0])
+        raise ValueError(found[0])
 
 
 def stop_for(stage: Stage, task: Task, here: Stop) -> Stop:

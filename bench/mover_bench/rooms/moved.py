@@ -6,16 +6,16 @@ a segmenter that tracks them would give it.
 """
 
 import math
-from dataclasses import fields, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from mover.core.records import axis_of
-from mover.core.types import Bodies, BodyPose, Masks, People, Scene, Segment
+from mover.core.types import People, Scene, Segment
 from mover.geometry.rle import decode, joined
+from mover.io.capture.pose_file import joined_bodies
 from mover_bench.rooms.compose import Plan, fits, in_view
 from mover_bench.rooms.config import RoomConfig
 from mover_bench.rooms.known import (
@@ -90,15 +90,18 @@ def _joined(first: KnownRoom, second: KnownRoom, index: int) -> KnownRoom:
     end = int(second.bodies.frame.max()) + 1
     before, after = range(0, change, EVERY), range(change + change % EVERY, end, EVERY)
     truth = _scene(first.truth, second.truth, index, change)
-    both = _both(first, second)
+    rooms = first, second
+    bodies = joined_bodies([room.bodies for room in rooms])
     capture = replace(
         first.capture,
-        bodies=both.bodies,
-        people=_both(first.capture.people, second.capture.people),
-        furniture=_both(_seen(first, before), _seen(second, after)),
+        bodies=bodies,
+        people=joined_people([room.capture.people for room in rooms if room.capture.people]),
+        furniture=joined_people([_seen(first, before), _seen(second, after)]),
     )
+    names = ("touching", "touched", "whole")
+    rows = {name: torch.cat([getattr(room, name) for room in rooms]) for name in names}
     actions = (*first.actions, *second.actions)
-    return replace(both, capture=capture, truth=truth, actions=actions)
+    return replace(first, **rows, bodies=bodies, capture=capture, truth=truth, actions=actions)
 
 
 def _shifted(rows: Rows, frames: int, people: int) -> Rows:
@@ -107,20 +110,10 @@ def _shifted(rows: Rows, frames: int, people: int) -> Rows:
     return replace(moved, frame=moved.frame + frames, person=moved.person + people)
 
 
-def _both(first: Rows, second: Rows) -> Rows:
-    """The rows of one record after those of the other; what has no rows is the first's."""
-    some: Any = first
-    found: dict[str, Any] = {}
-    for field in fields(some):
-        a, b = getattr(first, field.name), getattr(second, field.name)
-        axis = axis_of(field.type, ("bodies", "rows"))
-        if isinstance(a, Tensor) and axis is not None:
-            found[field.name] = torch.cat([a, b], axis)
-        elif isinstance(a, Masks):
-            found[field.name] = joined([a, b])
-        elif isinstance(a, Bodies | BodyPose):
-            found[field.name] = _both(a, b)
-    return replace(some, **found)
+def joined_people(parts: Sequence[People]) -> People:
+    """The rows of all masks, one after the other."""
+    frame, person = (torch.cat([getattr(p, name) for p in parts]) for name in ("frame", "person"))
+    return People(joined([p.masks for p in parts]), frame, person, parts[0].heights)
 
 
 def _seen(room: KnownRoom, frames: range) -> People:

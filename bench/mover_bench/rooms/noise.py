@@ -8,6 +8,7 @@ random numbers, so that changing one leaves the others as they were.
 """
 
 import io
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mover.bodies.skinning import open_body
-from mover.core.records import map_tensors
+from mover.core.records import map_tensors, rows_of
 from mover.core.types import Bodies, BodyPose, Camera, Capture, Mesh, Scene, SceneObject
 from mover.furniture.library import SEATS, another
 from mover.furniture.pieces import Furniture
@@ -28,7 +29,7 @@ from mover.stages.camera.find_lens import through_lens
 from mover_bench.rooms import noise_masks as masks
 from mover_bench.rooms.config import NoiseConfig
 from mover_bench.rooms.foreign import foreign_mesh
-from mover_bench.rooms.known import KnownRoom, one_thread, rounded
+from mover_bench.rooms.known import KnownRoom, one_thread, rounded_bodies
 from mover_bench.rooms.turns import from_vector, to_vector
 
 SEATS_FOR_ONE = ("chair", "armchair", "office chair", "stool")
@@ -37,48 +38,31 @@ SEATS_FOR_ONE = ("chair", "armchair", "office chair", "stool")
 def other_shapes(
     objects: tuple[SceneObject, ...],
     furniture: tuple[Furniture, ...],
-    noise: NoiseConfig,
-    rng: np.random.Generator,
+    share: float,
+    make: Callable[[Furniture, np.random.Generator], Mesh],
+    rngs: Sequence[np.random.Generator],
 ) -> tuple[SceneObject, ...]:
-    """Some meshes replaced by other designs that fill the same box."""
+    """A share of the meshes replaced by what is made of the furniture that they show."""
     out: list[SceneObject] = []
-    for thing, known in zip(objects, furniture, strict=True):
-        swap = float(rng.uniform()) < noise.other_shapes
-        new = another(known, rng)
-        ratio = torch.tensor(known.size) / torch.tensor(new.size)
-        mesh = Mesh(new.mesh.verts * ratio, new.mesh.faces) if swap else thing.mesh
-        out.append(replace(thing, mesh=mesh))
+    for thing, known, rng in zip(objects, furniture, rngs, strict=True):
+        swap, mesh = float(rng.uniform()) < share, make(known, rng)
+        out.append(replace(thing, mesh=mesh) if swap else thing)
     return tuple(out)
 
 
-def foreign_shapes(
-    objects: tuple[SceneObject, ...],
-    furniture: tuple[Furniture, ...],
-    noise: NoiseConfig,
-    seed: list[int],
-) -> tuple[SceneObject, ...]:
-    """Some meshes replaced by objects of the class as other programs would make them."""
-    out: list[SceneObject] = []
-    for index, (thing, known) in enumerate(zip(objects, furniture, strict=True)):
-        rng = np.random.default_rng([*seed, index])
-        swap = float(rng.uniform()) < noise.foreign
-        out.append(replace(thing, mesh=foreign_mesh(known, noise.warp, rng)) if swap else thing)
-    return tuple(out)
+def other_design(known: Furniture, rng: np.random.Generator) -> Mesh:
+    """Another design of the class that fills the same box."""
+    new = another(known, rng)
+    ratio = torch.tensor(known.size) / torch.tensor(new.size)
+    return Mesh(new.mesh.verts * ratio, new.mesh.faces)
 
 
 def noisy_bodies(room: KnownRoom, noise: NoiseConfig, rng: np.random.Generator) -> Bodies:
     """Bodies as a network would see them, skinned again from wrong pose parameters."""
-    bodies = room.bodies
     pose, keep = noisy_pose(room, noise, rng)
     verts, joints = open_body().posed(pose)
-    return replace(
-        bodies,
-        verts=rounded(verts[keep]),
-        joints=rounded(joints[keep]),
-        frame=bodies.frame[keep],
-        person=bodies.person[keep],
-        pose=map_tensors(lambda x: rounded(x[keep]), pose),
-    )
+    whole = replace(room.bodies, verts=verts, joints=joints, pose=pose)
+    return rounded_bodies(rows_of(whole, keep))
 
 
 def noisy_pose(
@@ -221,9 +205,16 @@ def add_noise(room: KnownRoom, noise: NoiseConfig, seed: int) -> Capture:
     objects = tuple(
         _noisy_object(thing, room.truth.camera, camera, noise, rng) for thing in room.truth.objects
     )
-    objects = other_shapes(objects, room.furniture, noise, stream(2))
-    if noise.foreign:
-        objects = foreign_shapes(objects, room.furniture, noise, [seed, 10])
+    kinds, count = room.furniture, len(objects)
+    rngs = [stream(2)] * count
+    objects = other_shapes(objects, kinds, noise.other_shapes, other_design, rngs)
+    if noise.foreign:  # of which each has a stream of its own
+
+        def foreign(known: Furniture, rng: np.random.Generator) -> Mesh:
+            return foreign_mesh(known, noise.warp, rng)
+
+        rngs = [np.random.default_rng([seed, 10, index]) for index in range(count)]
+        objects = other_shapes(objects, kinds, noise.foreign, foreign, rngs)
     detections = room.capture.detections
     if noise.mask_head or noise.mask_box or noise.amodal:
         detections = masks.headed(detections, room.truth, noise, stream(11))
@@ -267,14 +258,7 @@ def wrong_lens(capture: Capture, mean: float, rng: np.random.Generator) -> Captu
     if zoom == 1:
         return capture
     capture = replace(through_lens(capture, zoom), focal_spread=mean)
-    bodies = capture.bodies
-    if bodies is None or bodies.joints is None or bodies.pose is None:
-        return capture
-    bodies = replace(
-        bodies, verts=rounded(bodies.verts), joints=rounded(bodies.joints),
-        pose=map_tensors(rounded, bodies.pose),
-    )  # fmt: skip
-    return replace(capture, bodies=bodies)
+    return replace(capture, bodies=capture.bodies and rounded_bodies(capture.bodies))
 
 
 def _noisy_camera(camera: Camera, noise: NoiseConfig, rng: np.random.Generator) -> Camera:

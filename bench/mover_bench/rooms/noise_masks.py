@@ -3,7 +3,7 @@
 An initial scene has one object for each detection, so that the scene follows the detections.
 """
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import replace
 
 import numpy as np
@@ -28,24 +28,30 @@ def grown(mask: Bool[np.ndarray, "h w"], pixels: int) -> Bool[np.ndarray, "h w"]
     """The mask with its outline moved out by so many pixels, in where negative."""
     from scipy.ndimage import distance_transform_edt
 
-    if pixels == 0 or not mask.any() or mask.all():
+    if pixels == 0 or mask.all():
         return mask
-    window = _window(mask, abs(pixels) + 1)
-    part = mask[window]
-    out = np.zeros_like(mask)
-    if pixels > 0:
-        out[window] = np.asarray(distance_transform_edt(~part)) <= pixels
-    else:
-        out[window] = np.asarray(distance_transform_edt(part)) > -pixels
-    return out if out.any() else mask
+
+    def moved(part: np.ndarray) -> np.ndarray:
+        if pixels > 0:
+            return np.asarray(distance_transform_edt(~part)) <= pixels
+        return np.asarray(distance_transform_edt(part)) > -pixels
+
+    return _near(mask, abs(pixels) + 1, moved)
 
 
-def _window(mask: Bool[np.ndarray, "h w"], pad: int) -> tuple[slice, slice]:
-    """Rows and columns of a mask that is not empty, and so many pixels around it."""
+def _near(
+    mask: Bool[np.ndarray, "h w"], pad: int, drawn: Callable[[np.ndarray], np.ndarray]
+) -> Bool[np.ndarray, "h w"]:
+    """The mask drawn again in its window and `pad` pixels around; as it is if nothing were left."""
+    if not mask.any():
+        return mask
     rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    return np.s_[
+    window = np.s_[
         max(0, rows[0] - pad) : rows[-1] + pad + 1, max(0, cols[0] - pad) : cols[-1] + pad + 1
     ]
+    out = np.zeros_like(mask)
+    out[window] = drawn(mask[window])
+    return out if out.any() else mask
 
 
 def noisy_people(
@@ -290,15 +296,12 @@ def wobbled(
     """The mask with its outline moved by a smooth random field of a spread [px]."""
     from scipy.ndimage import distance_transform_edt, zoom
 
-    if not mask.any():
-        return mask
-    window = _window(mask, int(3 * pixels) + 2)
-    part = mask[window]
-    size = [int(np.ceil(side / WOBBLE)) + 2 for side in part.shape]
-    field = np.asarray(zoom(rng.normal(size=size), WOBBLE, order=1))
-    field = field[: part.shape[0], : part.shape[1]]
-    field = field * (pixels / max(float(field.std()), 1e-6))
-    near, beyond = (np.asarray(distance_transform_edt(x)) for x in (part, ~part))
-    out = np.zeros_like(mask)
-    out[window] = np.where(part, near - 0.5, 0.5 - beyond) + field > 0
-    return out if out.any() else mask
+    def moved(part: np.ndarray) -> np.ndarray:
+        size = [int(np.ceil(side / WOBBLE)) + 2 for side in part.shape]
+        field = np.asarray(zoom(rng.normal(size=size), WOBBLE, order=1))
+        field = field[: part.shape[0], : part.shape[1]]
+        field = field * (pixels / max(float(field.std()), 1e-6))
+        near, beyond = (np.asarray(distance_transform_edt(x)) for x in (part, ~part))
+        return np.where(part, near - 0.5, 0.5 - beyond) + field > 0
+
+    return _near(mask, int(3 * pixels) + 2, moved)

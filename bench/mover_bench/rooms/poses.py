@@ -11,9 +11,10 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from torch import Tensor
 
 from mover.bodies.skeleton import JOINTS, PARENTS
-from mover.bodies.skinning import open_body
+from mover.bodies.skinning import SkinnedBody, open_body
 from mover.core.records import record
 from mover.core.types import BodyPose
 from mover_bench.rooms.turns import X, Y, Z, about, apply, between, frame, to_vector, unit
@@ -101,28 +102,25 @@ class Posture:
 
 def rows(posture: Posture, index: np.ndarray | slice) -> Posture:
     """Some frames of a posture."""
-    fields = dataclasses.fields(posture)  # type: ignore[arg-type]
-    return Posture(**{f.name: getattr(posture, f.name)[index] for f in fields})
+    return Posture(**{name: value[index] for name, value in vars(posture).items()})
 
 
 def chain(postures: Sequence[Posture]) -> Posture:
     """One after the other."""
-    names = [f.name for f in dataclasses.fields(postures[0])]  # type: ignore[arg-type]
+    names = vars(postures[0])
     return Posture(**{n: np.concatenate([getattr(p, n) for p in postures]) for n in names})
 
 
 def blend(start: Posture, end: Posture, share: Float[np.ndarray, " frames"]) -> Posture:
     """Frames on the way from one posture (one frame each) to another."""
     out: dict[str, np.ndarray] = {}
-    for field in dataclasses.fields(start):  # type: ignore[arg-type]
-        a, b = getattr(start, field.name), getattr(end, field.name)
-        if field.name == "turn":
-            out[field.name] = between(a, b, share)
-        elif field.name == "feet":
-            out[field.name] = between(a, b, share[:, None])
+    for name, a in vars(start).items():
+        b = getattr(end, name)
+        if name in ("turn", "feet"):
+            out[name] = between(a, b, share if name == "turn" else share[:, None])
         else:
             w = share.reshape(-1, *[1] * (a.ndim - 1))
-            out[field.name] = (1 - w) * a + w * b
+            out[name] = (1 - w) * a + w * b
     return Posture(**out)
 
 
@@ -154,21 +152,20 @@ def skinned(
     person: Person, posture: Posture, part: Bool[np.ndarray, " verts"] | None = None
 ) -> Float[np.ndarray, "frames kept 3"]:
     """The skin, or a part of it, in the frame of the floor [m]."""
-    model = open_body()
-    if part is not None:
-        keep = torch.from_numpy(part)
-        verts, weights, dirs = model.verts[keep], model.weights[keep], model.shape_dirs[keep]
-        model = dataclasses.replace(model, verts=verts, weights=weights, shape_dirs=dirs)
+    model = open_body() if part is None else _with_verts(torch.from_numpy(part))
     return model.posed(angles(person, posture))[0].numpy()
 
 
 def jointed(person: Person, posture: Posture) -> Float[np.ndarray, "frames 22 3"]:
     """The joints of the body in the frame of the floor [m]."""
+    return _with_verts(slice(1)).posed(angles(person, posture))[1][:, :22].numpy()
+
+
+def _with_verts(keep: Tensor | slice) -> SkinnedBody:
+    """The open body with some of its vertices."""
     model = open_body()
-    few = dataclasses.replace(
-        model, verts=model.verts[:1], weights=model.weights[:1], shape_dirs=model.shape_dirs[:1]
-    )
-    return few.posed(angles(person, posture))[1][:, :22].numpy()
+    few = {name: getattr(model, name)[keep] for name in ("verts", "weights", "shape_dirs")}
+    return dataclasses.replace(model, **few)
 
 
 def chest_of(person: Person, posture: Posture) -> tuple[np.ndarray, np.ndarray]:

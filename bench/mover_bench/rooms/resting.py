@@ -84,19 +84,25 @@ def seated(person: Person, spot: Spot, piece: Placed) -> Posture:
 
 def hands_on_thighs(person: Person, posture: Posture) -> Posture:
     """Wrists above the middle of the thighs, elbows out."""
-    chest, shoulders = chest_of(person, posture)
-    wrists = []
+    goals = []
     for k in range(len(SIDES)):
         hip = posture.pelvis + apply(posture.turn, person.joints[LEG[k][0]])
         reach = person.joints[LEG[k][1]] - person.joints[LEG[k][0]]
         ahead = posture.ankles[:, k] - hip
         ahead = ahead * [1, 0, 1] / np.linalg.norm(ahead * [1, 0, 1], axis=-1, keepdims=True)
         thigh = np.linalg.norm(reach)
-        goal = hip + 0.5 * thigh * ahead + np.array([0, 0.115, 0])
-        wrists.append(apply(np.swapaxes(chest, 1, 2), goal - shoulders[:, k]))
+        goals.append(hip + 0.5 * thigh * ahead + np.array([0, 0.115, 0]))
     frames = len(posture.pelvis)
     elbows = np.broadcast_to([[0.45, -0.3, -0.8], [-0.45, -0.3, -0.8]], (frames, 2, 3)).copy()
-    return replace(posture, wrists=np.stack(wrists, 1), elbows=elbows)
+    return replace(_hands_at(person, posture, goals), elbows=elbows)
+
+
+def _hands_at(person: Person, posture: Posture, goals: list[np.ndarray]) -> Posture:
+    """The left and the right wrist at places in the room [m]."""
+    chest, shoulders = chest_of(person, posture)
+    turn = np.swapaxes(chest, 1, 2)
+    wrists = [apply(turn, goal - shoulders[:, k]) for k, goal in enumerate(goals)]
+    return replace(posture, wrists=np.stack(wrists, 1))
 
 
 def sit_down(person: Person, end: Posture, heading: float, share: np.ndarray) -> Posture:
@@ -263,7 +269,8 @@ def supine(person: Person, place: Berth, piece: Placed) -> Posture:
     middle = place.spot.edge - place.behind * facing(np.array(place.spot.heading))
     pelvis = np.array([[middle[0], place.spot.height + 0.12, middle[1]]])
     turn = _flat(place.head)
-    straight = _hands_on_hips(person, _stretched(person, pelvis, turn, place))
+    hips = [pelvis + apply(turn, np.array([[out * 0.17, 0.0, 0.12]])) for out in (1.0, -1.0)]
+    straight = _hands_at(person, _stretched(person, pelvis, turn, place), hips)
     lying = laid(person, straight, piece, "torso")
     return _head_down(person, _heels_down(person, lying, place), piece)
 
@@ -307,15 +314,6 @@ def _heels_down(person: Person, lying: Posture, place: Berth) -> Posture:
         low = apply(lying.feet[0, k], person.skin[side] - joint)[:, 1].min()
         ankles[:, k, 1] = place.spot.height - low
     return replace(lying, ankles=ankles)
-
-
-def _hands_on_hips(person: Person, lying: Posture) -> Posture:
-    chest, shoulders = chest_of(person, lying)
-    wrists = []
-    for k, out in enumerate((1.0, -1.0)):
-        place = lying.pelvis + apply(lying.turn, np.array([[out * 0.17, 0.0, 0.12]]))
-        wrists.append(apply(np.swapaxes(chest, 1, 2), place - shoulders[:, k]))
-    return replace(lying, wrists=np.stack(wrists, 1))
 
 
 def _head_down(person: Person, lying: Posture, piece: Placed) -> Posture:

@@ -12,7 +12,7 @@ from torch import Tensor
 from mover.bodies.parts import SOLES, members, parts_of
 from mover.bodies.skeleton import BODY
 from mover.core.records import record
-from mover.core.types import Bodies, Camera
+from mover.core.types import Bodies, Camera, Keypoints
 from mover.evaluate.scene import Metric
 from mover.geometry.rotations import similarity
 from mover.io.capture.pose_file import into_camera
@@ -26,8 +26,7 @@ class Standing:
 
     heights: Float[Tensor, "bodies soles"]
     """Height of each sole vertex above the floor, negative below [m]."""
-    tolerance: float
-    """How far a sole may be under the floor before it counts [m]."""
+    tolerance: float  #: How far a sole may be under the floor before it counts [m]
 
 
 @record
@@ -117,7 +116,9 @@ def procrustes(
     return size[..., None, None] * points @ turn.mT + shift.unsqueeze(-2)
 
 
-def shared_rows(bodies: Bodies, truth: Bodies) -> tuple[Int[Tensor, " rows"], Int[Tensor, " rows"]]:
+def shared_rows(
+    bodies: Bodies, truth: Bodies | Keypoints
+) -> tuple[Int[Tensor, " rows"], Int[Tensor, " rows"]]:
     """Rows of the two that are the same person in the same frame."""
     there = {key: row for row, key in enumerate(_keys(truth))}
     rows = [(row, there[key]) for row, key in enumerate(_keys(bodies)) if key in there]
@@ -125,7 +126,7 @@ def shared_rows(bodies: Bodies, truth: Bodies) -> tuple[Int[Tensor, " rows"], In
     return pairs[:, 0], pairs[:, 1]
 
 
-def _keys(bodies: Bodies) -> list[tuple[int, int]]:
+def _keys(bodies: Bodies | Keypoints) -> list[tuple[int, int]]:
     return list(zip(bodies.frame.tolist(), bodies.person.tolist(), strict=True))
 
 

@@ -28,21 +28,17 @@ class Nearness:
 
     signed: Float[Tensor, "bodies verts"]
     """Signed distance to the object that the vertex is deepest in or nearest to [m]."""
-    surface: Float[Tensor, "bodies verts"]
-    """Distance to the nearest surface [m]."""
+    surface: Float[Tensor, "bodies verts"]  #: Distance to the nearest surface [m]
 
 
 @record
 class Touch:
     """Bodies beside the furniture of their scene, and the same bodies in the true one."""
 
-    near: Nearness
-    """All bodies that are judged."""
-    shared: Nearness | None
-    """Those that the truth knows as well, vertex by vertex; None: no truth."""
+    near: Nearness  #: All bodies that are judged
+    shared: Nearness | None  #: Those that the truth knows as well, vertex by vertex; None: no truth
     true_shared: Nearness | None
-    reach: float
-    """A vertex touches what is at most so far away [m]."""
+    reach: float  #: A vertex touches what is at most so far away [m]
 
 
 @record

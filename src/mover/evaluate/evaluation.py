@@ -87,8 +87,7 @@ class _Populated:
 
     scene: Scene
     bodies: Bodies | None
-    soles: Int[Tensor, " soles"]
-    """The vertices under their feet."""
+    soles: Int[Tensor, " soles"]  #: The vertices under their feet
     furniture: tuple[StandingMesh, ...]
     """The closed objects where they stand; none where there are no people."""
 
@@ -101,15 +100,9 @@ def evaluate(
     config: EvaluateConfig | None = None,
     sides: Sequence[str] = compare.SIDES,
 ) -> dict[str, Any]:
-    """Measure a scene before and after against the truth.
+    """Measure a scene before (`initial`) and after (`result`), or one of them, against the truth.
 
-    Args:
-        initial: The scene that the run was given.
-        result: The scene that it made of it.
-        truth: The true scene.
-        bodies: The people of the three; without them their metrics are absent.
-        config: Densities and thresholds.
-        sides: Which of `initial` and `result` is measured.
+    `bodies` are the people of the three; without them their metrics are absent.
 
     Returns:
         What metrics.json holds: the means `initial` and `result`, and each of the `objects`.

@@ -35,10 +35,8 @@ class Metric(Generic[T]):
     """One line of the table of metrics."""
 
     label: str
-    unit: str
-    """`m`, `rad`, `share` or nothing."""
-    best: float
-    """What a perfect reconstruction scores: 1 where more is better, 0 where less is."""
+    unit: str  #: `m`, `rad`, `share` or nothing
+    best: float  #: What a perfect reconstruction scores: 1 where more is better, 0 where less is
     measure: Callable[[T], float | None]
     """The value, or None where the truth that it needs is missing."""
 
@@ -51,10 +49,8 @@ class Pair:
     estimate_camera: Camera
     truth: SceneObject
     truth_camera: Camera
-    samples: int
-    """Number of points on the true surface."""
-    boxes: bool = False
-    """The truth is a box: boxes are compared in the image, not what is drawn."""
+    samples: int  #: Number of points on the true surface
+    boxes: bool = False  #: The truth is a box: boxes are compared in the image, not what is drawn
 
 
 @record
@@ -159,14 +155,9 @@ def match(
 ) -> dict[str, SceneObject]:
     """Say which estimated object stands for which true one.
 
-    Names decide first. What they leave over is paired one to one within its class so that the
-    sum of the overlaps, in 3D and in the image, is greatest; without overlap the nearer one wins.
-
-    Args:
-        estimate: The scene that is judged.
-        truth: The true scene.
-        known: Id of the estimated object by id of the true one; unknown names are skipped.
-        by_place: Pair what names leave over; else it is missing, or stands for nothing.
+    Names decide first: `known` are ids of estimated objects by those of true ones. What they leave
+    over is paired one to one within its class (`by_place`) so that the sum of the overlaps, in 3D
+    and in the image, is greatest; without overlap the nearer one wins.
 
     Returns:
         The estimated object by id of the true one; a true object that is missing is not in it.
@@ -260,14 +251,9 @@ def measure_objects(
     samples: int,
     boxes: bool = False,
 ) -> list[dict[str, Any]]:
-    """Each true object in the initial scene and in the result, as far as they are asked for.
+    """Each true object of three scenes on some of the `SIDES`, as `pairs` has `found` them.
 
-    Args:
-        scenes: The initial one, the result and the truth.
-        found: What stands for the true objects on both `SIDES`, as `pairs` has it.
-        sides: Some of `SIDES`.
-        samples: Points on each true surface.
-        boxes: Whether the truth is boxes without meshes.
+    `samples` points stand for each true surface; `boxes`: the truth has no meshes.
     """
     initial, result, truth = scenes
     cameras = {"initial": initial.camera, "result": result.camera}
@@ -317,8 +303,7 @@ class Together:
     """All objects of a scene that stand for true ones."""
 
     pairs: tuple[Pair, ...]
-    missing: int
-    """True objects that nothing stands for: they count as 0."""
+    missing: int  #: True objects that nothing stands for: they count as 0
 
 
 @record

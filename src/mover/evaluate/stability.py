@@ -29,12 +29,9 @@ class Settled:
     """How far one object went."""
 
     id: str
-    moved: float
-    """Distance of its box's centre from where it was [m]."""
-    turned: float
-    """Angle between its attitudes [rad]."""
-    fixed: bool
-    """True: it hangs or is built in (`support` is free), so it was held."""
+    moved: float  #: Distance of its box's centre from where it was [m]
+    turned: float  #: Angle between its attitudes [rad]
+    fixed: bool  #: True: it hangs or is built in (`support` is free), so it was held
 
     @property
     def stays(self) -> bool:

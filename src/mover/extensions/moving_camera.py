@@ -39,7 +39,7 @@ FOOT = 0.08  # [m], the same of a foot, which errors of the pose move, too
 LOOSE = 0.1  # [m], an error of the farthest camera's position that deserves a warning
 RANGE = (-5.0, 3.0)  # logarithms of the scales that are tried, about the usual ratio
 TRIED = 321
-STEPS = 20  # of reweighted least squares
+STEPS = 20
 BLOCKS = 8  # parts of the video, each left out once for the spread
 DEEP = 3.0  # depths of bodies are so many times as uncertain as their pixels
 FEWEST = 20  # pairs
@@ -112,7 +112,9 @@ def find_scale(inputs: ScaleInputs, config: None = None, observe: Observer = sil
     if len(pairs.moved) < FEWEST or not float(pairs.camera.norm(dim=-1).max()) > 0:
         why = "too few frames with people give the scale of the camera's path: taken as metres"
         return PathScale(1.0, UNKNOWN, (why,))
-    scale = _descended(pairs, _first(parts))
+    scale = _first(parts)
+    for _ in range(STEPS):  # of reweighted least squares
+        scale = _solved(pairs, (1 + _squared(pairs, scale)).square().reciprocal())
     observe(Step("find_scale", 0, 1))
     spread = _spread(pairs, scale)
     warning = (
@@ -133,9 +135,12 @@ def _pairs(inputs: ScaleInputs, point: Float[Tensor, "bodies 3"], noise: float) 
     for person in bodies.person.unique():
         rows = (bodies.person == person).nonzero()[:, 0]
         rows = rows[bodies.frame[rows].argsort()]
+        frame = bodies.frame[rows]
         for wait in WAITS:
-            i, j = _apart(bodies.frame[rows], max(1, round(wait * fps)))
-            i, j = rows[i], rows[j]
+            goal = frame + max(1, round(wait * fps))
+            later = torch.searchsorted(frame, goal).clamp_max(len(frame) - 1)
+            there = frame[later] == goal
+            i, j = rows[there], rows[later[there]]
             ray = torch.nn.functional.normalize(position[i] + position[j], dim=-1)
             moved, camera = position[j] - position[i], t[j] - t[i]
             found.append((_weighted(moved, ray) / noise, _weighted(camera, ray) / noise, block[i]))
@@ -159,13 +164,6 @@ def _weighted(
     return way - (1 - 1 / DEEP) * (way * ray).sum(-1, keepdim=True) * ray
 
 
-def _apart(frame: Int[Tensor, " rows"], wait: int) -> tuple[Tensor, Tensor]:
-    """Pairs of rows that are so many frames apart; the frames rise."""
-    later = torch.searchsorted(frame, frame + wait).clamp_max(len(frame) - 1)
-    there = frame[later] == frame + wait
-    return there.nonzero()[:, 0], later[there]
-
-
 def _cost(pairs: _Pairs, scale: Float[Tensor, " tried"]) -> Float[Tensor, " tried"]:
     """Share of the pairs in which the point seems to move; at twice the noise, to be wide."""
     each = [_squared(pairs, float(s)) / 4 for s in scale]  # one at a time: memory of one
@@ -184,13 +182,6 @@ def _first(parts: list[_Pairs]) -> float:
     tried = moved / camera.clamp_min(1e-9) * torch.linspace(*RANGE, TRIED).double().exp()
     costs = torch.stack([_cost(pairs, tried) for pairs in parts])
     return float(tried[costs.sum(0).argmin()])
-
-
-def _descended(pairs: _Pairs, scale: float) -> float:
-    """Reweighted least squares from there."""
-    for _ in range(STEPS):
-        scale = _solved(pairs, (1 + _squared(pairs, scale)).square().reciprocal())
-    return scale
 
 
 def _solved(pairs: _Pairs, weight: Float[Tensor, " pairs"]) -> float:

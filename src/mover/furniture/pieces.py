@@ -21,26 +21,16 @@ Span = tuple[float, float]
 class Furniture:
     """One closed piece: +y up, +z front, origin at the centre of the box's bottom."""
 
-    category: str
-    """Canonical name."""
-    style: int
-    """Which design of the category it is."""
-    mesh: Mesh
-    """Closed, counter-clockwise seen from outside [m]."""
-    seat_height: float
-    """Height of the surface one sits or lies on [m]; 0: none."""
-    seat_left: float
-    """Smallest x of that surface [m]."""
-    seat_right: float
-    """Largest x of that surface [m]."""
-    seat_back: float
-    """Smallest z of that surface, where the backrest or the headboard begins [m]."""
-    seat_front: float
-    """Largest z of that surface: its front edge [m]."""
-    back_height: float
-    """Height of the backrest's upper edge [m]; 0: nothing to lean against."""
-    top_height: float
-    """Height of the highest surface that carries a hand or a thing [m]; 0: none."""
+    category: str  #: Canonical name
+    style: int  #: Which design of the category it is
+    mesh: Mesh  #: Closed, counter-clockwise seen from outside [m]
+    seat_height: float  #: Height of the surface one sits or lies on [m]; 0: none
+    seat_left: float  #: Smallest x of that surface [m]
+    seat_right: float  #: Largest x of that surface [m]
+    seat_back: float  #: Smallest z of that surface, where the backrest or the headboard begins [m]
+    seat_front: float  #: Largest z of that surface: its front edge [m]
+    back_height: float  #: Height of the backrest's upper edge [m]; 0: nothing to lean against
+    top_height: float  #: Height of the highest surface that carries a hand or a thing [m]; 0: none
 
     @property
     def seat_depth(self) -> float:
