@@ -16,7 +16,7 @@ from mover.io.capture.parts import Parts
 from mover.io.capture.plausible import check_plausible
 from mover.io.capture.pose_file import into_camera
 from mover.io.capture.scene_file import hypotheses_of, scene_of
-from mover.io.capture.tracks import pair_tracks, paired
+from mover.io.capture.tracks import pair_tracks
 from mover.io.files.fields import At, Warn, listed
 from mover.io.files.schema import checked
 
@@ -129,10 +129,9 @@ def _same_people(
         return bodies, people
     if bodies is None:
         return bodies, people
-    pairs = pair_tracks(bodies, people.people, camera)
-    for note in pairs.notes:
+    bodies, masks, notes = pair_tracks(bodies, people.people, camera)
+    for note in notes:
         warn(note)
-    bodies, masks = paired(bodies, people.people, pairs)
     shown, rows = (
         set(zip(one.frame.tolist(), one.person.tolist(), strict=True)) for one in (masks, bodies)
     )

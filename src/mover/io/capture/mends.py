@@ -15,7 +15,7 @@ from mover.core.types import Camera, Capture, Detection, Masks, SceneObject, Seg
 from mover.geometry.camera import pitch_roll, tilted
 from mover.geometry.rle import area, mask_boxes, run_lengths
 from mover.io.capture.agreement import assigned, box_around, in_image, pairwise_iou2d
-from mover.io.capture.tracks import pair_tracks, paired
+from mover.io.capture.tracks import pair_tracks
 
 LEAST = 0.2  # overlap of a body and the mask that it lies on
 Mend = Callable[[Capture], Capture]
@@ -153,9 +153,8 @@ def same_tracks(capture: Capture) -> Capture:
     bodies, seen = capture.bodies, capture.people
     if bodies is None or seen is None:
         return capture
-    pairs = pair_tracks(bodies, seen, capture.scene.camera)
-    bodies, seen = paired(bodies, seen, pairs)
-    return replace(capture, bodies=bodies, people=seen) if pairs.notes else capture
+    bodies, seen, notes = pair_tracks(bodies, seen, capture.scene.camera)
+    return replace(capture, bodies=bodies, people=seen) if notes else capture
 
 
 def by_masks(capture: Capture) -> Capture:
