@@ -32,11 +32,15 @@ Rows = list[tuple[int, int, tuple[float, float, float]]]
 """Frames, tracks and positions."""
 
 
+def numbers_of(rows: Rows) -> list[torch.Tensor]:
+    """Frames and tracks."""
+    return [torch.tensor([row[k] for row in rows]) for k in (0, 1)]
+
+
 def bodies_of_rows(rows: Rows) -> Bodies:
     """Boxes of a person's size, each a frame, a track and a position."""
     verts = torch.stack([CORNERS + torch.tensor(place) for _, _, place in rows])
-    frame, person = (torch.tensor([row[k] for row in rows]) for k in (0, 1))
-    return Bodies(verts, FACES, None, (), frame, person, 30.0, "camera", None)
+    return Bodies(verts, FACES, None, (), *numbers_of(rows), 30.0, "camera", None)
 
 
 def masks_of(rows: Rows, shown: float = 1.0) -> People:
@@ -48,8 +52,8 @@ def masks_of(rows: Rows, shown: float = 1.0) -> People:
         mask = torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.bool)
         mask[top : top + round(float(low - top) * shown), left:right] = True
         codes.append(encode(mask))
-    frame, person = (torch.tensor([row[k] for row in rows]) for k in (0, 1))
-    return People(Masks(CAMERA.height, CAMERA.width, tuple(codes)), frame, person, {"1": 1.8})
+    masks = Masks(CAMERA.height, CAMERA.width, tuple(codes))
+    return People(masks, *numbers_of(rows), {"1": 1.8})
 
 
 def walkers(first: int, second: int) -> Rows:

@@ -236,11 +236,11 @@ def _on_masks(
 
 
 def partners(
-    frame: Int[Tensor, "*rows"], person: Int[Tensor, "*rows"], people: People
+    frame: Int[Tensor, "*rows"], person: Int[Tensor, "*rows"], others: People | Bodies
 ) -> Int[Tensor, "*rows"]:
-    """Row of the mask of a person in a frame, -1: none."""
-    wide = 1 + max(int(person.max()), int(people.person.max()))
-    ours, theirs = frame * wide + person, people.frame * wide + people.person
+    """Row of the mask, or body, of a person in a frame, -1: none."""
+    wide = 1 + max(int(person.max()), int(others.person.max()))
+    ours, theirs = frame * wide + person, others.frame * wide + others.person
     order = theirs.argsort()
     row = order[torch.searchsorted(theirs[order], ours).clamp_max(len(order) - 1)]
     return torch.where(theirs[row] == ours, row, torch.full_like(row, -1))
