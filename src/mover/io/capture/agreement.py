@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from operator import attrgetter
 
@@ -50,9 +50,7 @@ class Agreement:
 
 
 NOTHING = Agreement(*[torch.zeros(0)] * 8, boxes=torch.zeros(0, 4))
-SCORES = (
-    "objects", "sizes", "turns", "object_masks", "people_masks", "people", "heights", "upright",
-)  # fmt: skip
+SCORES = [field.name for field in fields(Agreement) if field.name != "boxes"]
 
 
 def thinned_capture(capture: Capture) -> Capture:

@@ -190,11 +190,7 @@ def _masks_of(
 def furniture_of(
     at: At, camera: Camera, detections: tuple[Detection, ...], warn: Warn
 ) -> People | None:
-    """The objects' visible masks in some frames; tracks are numbers of annotations.
-
-    Raises:
-        InputError: If a field is wrong, or a track is no annotation of objects.json.
-    """
+    """The objects' visible masks in some frames; tracks are ids of annotations in objects.json."""
     found = people_of(at, camera, warn).people
     known = {detection.id for detection in detections}
     for item in at.get("annotations").items():

@@ -48,13 +48,12 @@ def build_capture(parts: Parts) -> Capture:
         warn("contacts.npz: there are no bodies, so it is not used")
     _check_frames(parts, bodies)
     bodies, people = _same_people(bodies, people, camera, warn)
-    others, furniture, path = (), None, STILL
-    if parts.hypotheses is not None:
-        others = hypotheses_of(parts.hypotheses, parts.load_mesh, scene, warn)
+    given, path = parts.hypotheses, STILL
+    others = hypotheses_of(given, parts.load_mesh, scene, warn) if given else ()
     if parts.load_image is None:
         warn(f"{parts.no_image}: there is no picture to draw on")
-    if parts.furniture is not None:
-        furniture = furniture_of(parts.furniture, camera, detections, warn)
+    given = parts.furniture
+    furniture = furniture_of(given, camera, detections, warn) if given else None
     if parts.cameras is not None:
         path = path_of(parts.cameras, camera, bodies, warn)
         space = None if parts.bodies is None or is_still(path) else parts.bodies.get("space")

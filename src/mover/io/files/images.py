@@ -224,13 +224,9 @@ def _of_png(path: Path, metric: bool) -> NDArray[np.float64]:
     kind = "a depth map" if metric else "a map of inverse depth"
     with opened(path, expected=kind, bombs="error") as picture:
         mode, values = picture.mode, np.asarray(picture, dtype=np.float64)
+    expected = "" if values.ndim == 2 else "one grey value, larger where nearer"
     if metric and not mode.startswith("I"):
-        raise InputError(
-            f"{path.name}: has {mode} pixels, expected 16 bits of millimetres (8 bits or colours "
-            "have no unit)"
-        )
-    if values.ndim != 2:
-        raise InputError(
-            f"{path.name}: has {mode} pixels, expected one grey value, larger where nearer"
-        )
+        expected = "16 bits of millimetres (8 bits or colours have no unit)"
+    if expected:
+        raise InputError(f"{path.name}: has {mode} pixels, expected {expected}")
     return values / MILLIMETRES if metric else values
