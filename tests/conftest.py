@@ -44,6 +44,14 @@ def tiny():
     return tiny_room()
 
 
+@pytest.fixture
+def folder(tmp_path):
+    """The folder of a tiny capture with everything in it."""
+    from tiny_capture import write_capture
+
+    return write_capture(tmp_path / "tiny")
+
+
 @pytest.fixture(scope="session")
 def small_room():
     """A known room with few frames."""

@@ -1,7 +1,6 @@
 """Scene, bodies and masks are held against each other, and what is wrong is named."""
 
-import importlib.util
-import sys
+import runpy
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,13 +22,7 @@ from mover.io.capture.agreement import (
 from mover.io.capture.faults import check_against_picture, write_mended
 from mover.io.capture.folder import read_capture, write_capture
 
-FILE = Path(__file__).parents[1] / "benchmarks" / "faults.py"
-SPEC = importlib.util.spec_from_file_location("faults_of_users", FILE)
-assert SPEC is not None
-assert SPEC.loader is not None
-bench = importlib.util.module_from_spec(SPEC)
-sys.modules[SPEC.name] = bench
-SPEC.loader.exec_module(bench)
+FAULTS = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "faults.py"))["FAULTS"]
 
 
 def masks_of(boxes: torch.Tensor, width: int, height: int) -> Masks:
@@ -71,9 +64,9 @@ def test_what_lies_on_its_picture_has_no_fault(right):
     assert check_against_picture(right).warnings == ()
 
 
-@pytest.mark.parametrize("name", bench.FAULTS)
+@pytest.mark.parametrize("name", FAULTS)
 def test_a_fault_is_named_and_mended(right, name):
-    words, change = bench.FAULTS[name]
+    words, change = FAULTS[name]
     harmed = change(right)
     if harmed is None:
         pytest.skip("this room has nothing that shows it")
@@ -104,7 +97,7 @@ def test_parts_of_different_pictures_and_nothing_to_compare_are_said(right):
 
 
 def test_a_mended_capture_is_written_beside_the_given_one(right, tmp_path):
-    harmed = bench.FAULTS["bodies 5 frames late"][1](right)
+    harmed = FAULTS["bodies 5 frames late"][1](right)
     write_capture(harmed, tmp_path / "in")
     (tmp_path / "in" / "notes.txt").write_text("mine")
     given = read_capture(tmp_path / "in")

@@ -1,4 +1,3 @@
-import json
 from typing import Any
 
 import numpy as np
@@ -42,23 +41,17 @@ def make(**changes: object) -> Capture:
     return capture_from_arrays(given.pop("camera"), given.pop("objects"), **given)
 
 
-def test_arrays_give_the_same_capture_as_the_folder(tmp_path):
-    folder = tiny.write_capture(tmp_path / "tiny")
+def test_arrays_give_the_same_capture_as_the_folder(folder):
     # What arrays cannot say the same way: where the ground is, and numbers of annotations.
-    scene, objects = tiny.scene(), tiny.objects()
-    del scene["ground"]
+    tiny.change(folder / "scene.json", "ground", ...)
     for i in range(2):
-        scene["objects"][i]["annotation"] = objects["annotations"][i]["id"] = i
-    (folder / "scene.json").write_text(json.dumps(scene))
-    (folder / "objects.json").write_text(json.dumps(objects))
+        tiny.change(folder / "scene.json", f"objects.{i}.annotation", i)
+        tiny.change(folder / "objects.json", f"annotations.{i}.id", i)
     close(read_capture(folder), make())
 
 
 @pytest.mark.parametrize(("change", "words"), [
-    (
-        {"objects": [chair(mask=tiny.object_mask(0)[1:])]},
-        r"annotations\[0\].segmentation.*size",
-    ),
+    ({"objects": [chair(mask=tiny.object_mask(0)[1:])]}, r"annotations\[0\].segmentation.*size"),
     ({"objects": [chair(mask=tiny.object_mask(0) * 1.0)]}, r"objects\[0\].mask.*booleans"),
     ({"objects": [chair(mask=tiny.object_mask(0) & False)]}, "an empty mask"),
     ({"objects": [chair(vertices=tiny.STEP * np.nan)]}, r"objects\[0\].vertices' has nan"),

@@ -3,7 +3,6 @@
 import json
 import zipfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,18 +13,6 @@ from mover.core.errors import InputError
 from mover.io.capture.folder import read_capture
 
 NAN = float("nan")
-
-
-@pytest.fixture
-def folder(tmp_path):
-    return tiny.write_capture(tmp_path / "tiny")
-
-
-def put(folder: Path, file: str, path: str, value: Any) -> None:
-    """Set the field `a.0.b` of a JSON file; `...` deletes it."""
-    tree = json.loads((folder / file).read_text())
-    tiny.put(tree, [int(key) if key.isdigit() else key for key in path.split(".")], value)
-    (folder / file).write_text(json.dumps(tree))
 
 
 def refused(folder: Path, file: str, words: str) -> str:
@@ -139,7 +126,7 @@ JSON = [
 
 @pytest.mark.parametrize(("file", "path", "value", "words"), JSON)
 def test_a_wrong_field_is_named(folder, file, path, value, words):
-    put(folder, file, path, value)
+    tiny.change(folder / file, path, value)
     refused(folder, file, words)
 
 
@@ -181,8 +168,10 @@ ARRAYS = [
     ("body_pose", np.zeros((3, 63)), "'model' has nothing"),
     ("vertices", VERTS * 1000, "millimetres.*are they in metres"),
     ("vertices", VERTS * 100, "centimetres.*are they in metres"),
+    ("vertices", VERTS * np.float32(39.37), "in inches.*are they in metres"),
     ("vertices", VERTS / 1000, "are they in metres"),
-    ("vertices", -VERTS, "behind the camera"),
+    ("vertices", -VERTS, "behind the camera.*'space'"),
+    ("vertices", VERTS - VERTS.mean(1, keepdims=True), "was the translation left out"),
     ("vertices", with_one(VERTS, 1e8), "1e.08 m away in row 1"),
     ("fps", np.array(1e-8), "'fps' has 1e-08"),
     ("probability", tiny.touch()[:2], "shape"),
@@ -256,7 +245,7 @@ def test_a_mesh_without_a_surface_is_named(folder, text, words):
 
 @pytest.mark.parametrize("kind", ["glb", "gltf", "ply", "off", "stl"])
 def test_a_broken_mesh_file_is_named(folder, kind):
-    put(folder, "scene.json", "objects.0.mesh", f"meshes/broken.{kind}")
+    tiny.change(folder / "scene.json", "objects.0.mesh", f"meshes/broken.{kind}")
     for content in (b"", b"solid x\n", bytes(range(256)) * 3):
         (folder / "meshes" / f"broken.{kind}").write_bytes(content)
         refused(folder, "scene.json", "broken|empty mesh")
@@ -270,7 +259,7 @@ def test_a_broken_mesh_file_is_named(folder, kind):
 def test_a_gltf_that_reaches_out_of_its_folder_or_of_memory_is_refused(folder, tree, words):
     (folder.parent.parent / "secret.bin").write_bytes(b"1234")
     (folder / "meshes" / "a.gltf").write_text(json.dumps(tree))
-    put(folder, "scene.json", "objects.0.mesh", "meshes/a.gltf")
+    tiny.change(folder / "scene.json", "objects.0.mesh", "meshes/a.gltf")
     refused(folder, "scene.json", words)
 
 
@@ -316,7 +305,7 @@ def test_frames_behind_the_end_of_the_video_are_refused(folder):
     ("camera.json", "R_cam_world", [[1, 0, 0], [0, 0, 1], [0, -1, 0]], "straight up or down"),
 ])  # fmt: skip
 def test_what_is_odd_but_not_wrong_is_a_warning(folder, file, path, value, words):
-    put(folder, file, path, value)
+    tiny.change(folder / file, path, value)
     assert words in "\n".join(read_capture(folder).warnings)
 
 
@@ -332,10 +321,9 @@ def test_odd_bodies_are_a_warning(folder, name, shift, words):
 
 
 def test_two_objects_with_one_mask_are_a_warning(folder):
-    tree = tiny.objects()
+    first = tiny.objects()["annotations"][0]
     for key in ("segmentation", "bbox"):
-        tree["annotations"][1][key] = tree["annotations"][0][key]
-    (folder / "objects.json").write_text(json.dumps(tree))
+        tiny.change(folder / "objects.json", f"annotations.1.{key}", first[key])
     assert "2 objects (chair_0, Lampe_ä.2) have one" in "\n".join(read_capture(folder).warnings)
 
 
@@ -348,5 +336,5 @@ def test_a_link_to_nothing_is_no_missing_file(folder, name):
 
 def test_a_wrong_hypothesis_is_named_by_its_object_and_row(folder):
     (folder / "hypotheses.json").write_text(json.dumps(tiny.hypotheses()))
-    put(folder, "hypotheses.json", "objects.chair_0.1.yaw", NAN)
+    tiny.change(folder / "hypotheses.json", "objects.chair_0.1.yaw", NAN)
     refused(folder, "hypotheses.json", r"objects.chair_0\[1\].yaw' has nan")

@@ -60,7 +60,7 @@ def meshes_of(shift: float = 0.0) -> dict[str, np.ndarray]:
     return {"vertices": verts, "faces": MODEL.faces.numpy()}
 
 
-def test_parameters_alone_are_posed_also_in_a_capture(tmp_path):
+def test_parameters_alone_are_posed_also_in_a_capture(tmp_path, folder):
     found, words = read(save(tmp_path, **rows(), **parameters()))
     verts, joints = MODEL.posed(pose())
     assert torch.allclose(found.verts, verts, atol=1e-6)
@@ -68,7 +68,6 @@ def test_parameters_alone_are_posed_also_in_a_capture(tmp_path):
     assert found.joint_names == MODEL.joint_names
     assert found.pose is not None
     assert not words
-    folder = tiny.write_capture(tmp_path / "tiny")
     (folder / "contacts.npz").unlink()
     save(folder, **rows(), **parameters())
     found = read_capture(folder)

@@ -13,9 +13,9 @@ from PIL import Image
 
 from mover.app.cli import run_command
 from mover.core.errors import InputError
-from mover.core.types import Masks
+from mover.core.types import Bodies, Camera, Masks
 from mover.geometry.rle import decode
-from mover.io.capture.camera_file import path_of
+from mover.io.capture.camera_file import LEVEL, path_of
 from mover.io.capture.folder import read_capture
 from mover.io.capture.parts import UNKNOWN
 from mover.io.files.fields import At
@@ -94,11 +94,8 @@ def test_what_holds_no_masks_is_named(name: str, tmp_path: Path) -> None:
 def test_of_a_folder_of_labelme_files_that_of_the_picture_counts(tmp_path: Path) -> None:
     shape = {"label": "chair", "points": [[10, 8], [30, 8], [30, 40]], "shape_type": "polygon"}
     for name, label in (("other", "sofa"), ("room", "chair")):
-        tree = {
-            "imageWidth": SIZE[0],
-            "imageHeight": SIZE[1],
-            "shapes": [{**shape, "label": label}],
-        }
+        shapes = [{**shape, "label": label}]
+        tree = {"imageWidth": SIZE[0], "imageHeight": SIZE[1], "shapes": shapes}
         (tmp_path / f"{name}.json").write_text(json.dumps(tree))
     found = read_things(tmp_path, {}, SIZE, "room.jpg")
     assert [item.category for item in found.items] == ["chair"]
@@ -123,11 +120,6 @@ def test_a_picture_that_cannot_be_opened_is_named(data: bytes, words: str, tmp_p
     assert str(tmp_path) not in str(caught.value)
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    return tiny.write_capture(tmp_path / "tiny")
-
-
 DEPTHS = [
     (3500.0, "millimetres"), (350.0, "centimetres"), (-3.5, "negate"), (0.2, "disparity/"),
     (0.0, "0 % usable"), (np.nan, "0 % usable"),
@@ -150,39 +142,12 @@ def test_files_in_one_anothers_place_are_named(one: str, other: str, folder: Pat
 
 
 def test_two_cameras_of_a_capture_are_said(folder: Path) -> None:
-    tree = json.loads((folder / "camera.json").read_text())
-    scene = json.loads((folder / "scene.json").read_text())
-    scene["camera"] = {**tree, "fl_x": tree["fl_x"] * 1.25}
-    (folder / "scene.json").write_text(json.dumps(scene))
-    (said,) = [text for text in read_capture(folder).warnings if "not camera.json" in text]
-    assert said.startswith("scene.json: its camera counts")
-    scene["camera"] = tree | {"R_cam_world": [[1, 0, 0], [0, -0.8, 0.6], [0, -0.6, -0.8]]}
-    (folder / "scene.json").write_text(json.dumps(scene))
-    (said,) = [text for text in read_capture(folder).warnings if "not camera.json" in text]
-    assert "pitch -0.64 rad" in said
-
-
-BODIES: list[tuple[Callable[[np.ndarray], np.ndarray], str]] = [
-    (lambda v: v * 39.37, "in inches"),
-    (lambda v: v * 100, "in centimetres"),
-    (lambda v: v * 1000, "in millimetres"),
-    (lambda v: v - v.mean(1, keepdims=True), "translation left out"),
-    (lambda v: v * [1, -1, -1], "'space'"),
-]
-
-
-@pytest.mark.parametrize(("change", "words"), BODIES)
-def test_bodies_of_another_unit_or_frame_are_named(change, words, folder):
-    arrays = tiny.bodies()
-    verts = arrays["vertices"]
-    size = np.linalg.norm(verts.max(1) - verts.min(1), axis=1).mean()
-    middle = verts.mean(1, keepdims=True)
-    verts = middle + (verts - middle) * 1.8 / size  # of a person
-    arrays = {k: v for k, v in arrays.items() if not k.startswith("joint")}
-    arrays["vertices"] = change(verts)
-    np.savez(folder / "bodies.npz", **arrays)
-    with pytest.raises(InputError, match=words):
-        read_capture(folder)
+    tilted = [[1, 0, 0], [0, -0.8, 0.6], [0, -0.6, -0.8]]
+    for other, words in (({"fl_x": 75.0}, "fl_x 75"), ({"R_cam_world": tilted}, "pitch -0.64 rad")):
+        tiny.change(folder / "scene.json", "camera", tiny.camera(**other))
+        (said,) = [text for text in read_capture(folder).warnings if "not camera.json" in text]
+        assert said.startswith("scene.json: its camera counts")
+        assert words in said
 
 
 FLIP = np.diag([1.0, -1, -1, 1])
@@ -196,8 +161,6 @@ POSES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 @pytest.mark.parametrize("words", POSES)
 def test_poses_under_which_people_move_too_much_are_named(words: str) -> None:
-    from mover.core.types import Bodies, Camera
-
     n = 40
     turn = np.linspace(0, 0.6, n)
     T = np.tile(np.eye(4), (n, 1, 1))
@@ -208,11 +171,10 @@ def test_poses_under_which_people_move_too_much_are_named(words: str) -> None:
     seen = (np.linalg.inv(T) @ np.concatenate([place, np.ones((n, 1))], 1)[..., None])[:, :3, 0]
     verts = torch.from_numpy(seen).float()[:, None] + 0.3 * torch.eye(3)[None]
     rows = torch.arange(n)
-    bodies = Bodies(
-        verts, torch.tensor([[0, 1, 2]]), None, (), rows, rows * 0, 30.0, "camera", None
-    )
+    faces = torch.tensor([[0, 1, 2]])
+    bodies = Bodies(verts, faces, None, (), rows, rows * 0, 30.0, "camera", None)
     K = torch.tensor([[500.0, 0, 320], [0, 500, 180], [0, 0, 1]])
-    camera = Camera(K, torch.diag(torch.tensor([1.0, -1, -1])), 640, 360)
+    camera = Camera(K, LEVEL, 640, 360)
     said: list[str] = []
     at = At({"frame": rows.numpy(), "T_world_camera": POSES[words](T)}, "cameras.npz")
     path_of(at, camera, bodies, said.append)
@@ -242,11 +204,11 @@ def test_keypoints_of_another_size_of_the_video_are_refused(tmp_path, capsys):
 
 
 def test_what_is_too_large_is_refused_at_once(folder: Path) -> None:
-    tree = json.loads((folder / "objects.json").read_text())
-    rows = [{**tree["annotations"][0], "id": k} for k in range(50_000)]
-    (folder / "objects.json").write_text(json.dumps({**tree, "annotations": rows}))
+    rows = [{**tiny.objects()["annotations"][0], "id": k} for k in range(50_000)]
+    tiny.change(folder / "objects.json", "annotations", rows)
     with pytest.raises(InputError, match="'annotations' has 50000 items, expected at most 5000"):
         read_capture(folder)
-    (folder / "camera.json").write_text(json.dumps(tiny.camera(w=13_000, h=13_000)))
+    tiny.change(folder / "camera.json", "w", 13_000)
+    tiny.change(folder / "camera.json", "h", 13_000)
     with pytest.raises(InputError, match=r"13000 x 13000, expected at most .* scale image"):
         read_capture(folder)

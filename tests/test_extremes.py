@@ -16,11 +16,6 @@ pytestmark = pytest.mark.slow
 GROWN = 8  # 480 x 270 to 3,840 x 2,160
 
 
-@pytest.fixture
-def capture(small_capture) -> Capture:
-    return small_capture
-
-
 def changed(capture: Capture, **fields: object) -> Capture:
     """The capture with its first object changed."""
     first, *rest = capture.scene.objects
@@ -38,7 +33,7 @@ def ends_finite(capture: Capture, folder: Path) -> None:
         assert value.isfinite().all()
 
 
-def test_a_mesh_of_half_a_million_faces(capture, tmp_path):
+def test_a_mesh_of_half_a_million_faces(small_capture, tmp_path):
     import trimesh
 
     ball = trimesh.creation.icosphere(subdivisions=7, radius=0.4)  # 327,680 faces
@@ -47,7 +42,7 @@ def test_a_mesh_of_half_a_million_faces(capture, tmp_path):
     both = trimesh.util.concatenate([ball, disc])
     assert len(both.faces) == 491520
     mesh = Mesh(torch.tensor(both.vertices).float(), torch.tensor(both.faces))
-    ends_finite(changed(capture, mesh=mesh), tmp_path)
+    ends_finite(changed(small_capture, mesh=mesh), tmp_path)
 
 
 TRIANGLE = Mesh(torch.tensor([[0.0, 0, 0], [0.5, 0, 0], [0, 0.8, 0]]), torch.tensor([[0, 1, 2]]))
@@ -59,20 +54,20 @@ OBJECTS = {
 
 
 @pytest.mark.parametrize("name", OBJECTS)
-def test_an_object(name, capture, tmp_path):
-    behind = to_camera(torch.tensor([[0.0, -1.4, 3.0]]), capture.scene.camera.R_cam_world)
+def test_an_object(name, small_capture, tmp_path):
+    behind = to_camera(torch.tensor([[0.0, -1.4, 3.0]]), small_capture.scene.camera.R_cam_world)
     assert behind[0, 2] < -1
-    ends_finite(changed(capture, **OBJECTS[name]), tmp_path)
+    ends_finite(changed(small_capture, **OBJECTS[name]), tmp_path)
 
 
-def test_bodies_behind_the_camera(capture, tmp_path):
-    bodies = capture.bodies
+def test_bodies_behind_the_camera(small_capture, tmp_path):
+    bodies = small_capture.bodies
     moved = replace(bodies, verts=bodies.verts + torch.tensor([0.0, 0, 12.0]), pose=None)
-    ends_finite(replace(capture, bodies=moved), tmp_path)
+    ends_finite(replace(small_capture, bodies=moved), tmp_path)
 
 
-def test_an_image_of_4k(capture, tmp_path):
-    scene, people = capture.scene, capture.people
+def test_an_image_of_4k(small_capture, tmp_path):
+    scene, people = small_capture.scene, small_capture.people
     camera = replace(
         scene.camera, K=scene.camera.K * torch.tensor([[GROWN], [GROWN], [1.0]]),
         width=GROWN * scene.camera.width, height=GROWN * scene.camera.height,
@@ -80,10 +75,10 @@ def test_an_image_of_4k(capture, tmp_path):
     assert (camera.width, camera.height) == (3840, 2160)
     found = tuple(
         replace(d, box=GROWN * d.box, mask=None if d.mask is None else enlarged(d.mask))
-        for d in capture.detections
+        for d in small_capture.detections
     )
     large = replace(
-        capture, scene=replace(scene, camera=camera), reference=None, reference_people=None,
+        small_capture, scene=replace(scene, camera=camera), reference=None, reference_people=None,
         detections=found, people=replace(people, masks=enlarged(people.masks)),
     )  # fmt: skip
     ends_finite(large, tmp_path)

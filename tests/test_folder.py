@@ -18,11 +18,6 @@ from mover.io.formats import FORMATS, IMPORTED, chosen, names, read
 DATA = Path(__file__).parents[2] / "shared" / "data"
 
 
-@pytest.fixture
-def folder(tmp_path):
-    return tiny.write_capture(tmp_path / "tiny")
-
-
 def close(a: object, b: object) -> None:
     """Equal records: numbers to 1e-6, all else exactly; where meshes lie does not count."""
     if isinstance(a, torch.Tensor):
@@ -137,7 +132,7 @@ def test_a_capture_without_anything_optional_is_read_with_a_word_about_each(fold
 def test_what_scene_json_says_about_the_camera_wins(folder):
     other = tiny.camera(fl_x=70.0)
     del other["R_cam_world"]
-    (folder / "scene.json").write_text(json.dumps({**tiny.scene(), "camera": other}))
+    tiny.change(folder / "scene.json", "camera", other)
     camera = read_capture(folder).scene.camera
     assert float(camera.K[0, 0]) == 70
     assert float(pitch_roll(camera.R_cam_world)[0]) == pytest.approx(tiny.PITCH, abs=1e-6)

@@ -76,14 +76,6 @@ def limited(seconds: int) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-def said(error: InputError) -> str:
-    """The sentence of an error: one line, not too long, with what was expected."""
-    text = str(error)
-    assert "\n" not in text, text
-    assert 20 < len(text) < 700, text
-    return text
-
-
 def in_json(folder: Path, rng: np.random.Generator) -> str:
     """One value of one file is another, is a multiple of itself, or is not there."""
     path = folder / str(rng.choice(["camera", "scene", "objects", "people", "hypotheses"]))
@@ -187,12 +179,14 @@ def check_sane(capture: Capture) -> None:
 
 @contextmanager
 def or_refused(counts: Counter[str], what: str, most: int = LONGEST) -> Iterator[None]:
-    """An `InputError` is read and counted, any other error fails; all within some seconds."""
+    """An `InputError` is a sentence and counted, any other error fails; all in some seconds."""
     try:
         with limited(most):
             yield
     except InputError as error:
-        said(error)
+        text = str(error)
+        assert "\n" not in text, text
+        assert 20 < len(text) < 700, text
         counts["refused"] += 1
     except Exception as error:
         raise AssertionError(f"{what}: {error!r}") from error
@@ -205,8 +199,10 @@ def whole(tmp_path_factory):
     return folder
 
 
-def mutations(whole: Path, numbers: range) -> Counter[str]:
-    """What became of mutated captures."""
+@pytest.mark.parametrize("numbers", [
+    range(FEW), pytest.param(range(FEW, FEW + ALL), marks=pytest.mark.slow),
+])  # fmt: skip
+def test_mutated_captures_are_taken_warned_of_or_refused(whole, numbers):
     counts: Counter[str] = Counter()
     copy = whole.parent / "copy"
     for number in numbers:
@@ -218,14 +214,6 @@ def mutations(whole: Path, numbers: range) -> Counter[str]:
             capture = read_capture(copy)
             check_sane(capture)
             counts["warned" if capture.warnings else "taken"] += 1
-    return counts
-
-
-@pytest.mark.parametrize("numbers", [
-    range(FEW), pytest.param(range(FEW, FEW + ALL), marks=pytest.mark.slow),
-])  # fmt: skip
-def test_mutated_captures_are_taken_warned_of_or_refused(whole, numbers):
-    counts = mutations(whole, numbers)
     assert sum(counts.values()) == len(numbers)
 
 
@@ -269,30 +257,24 @@ def readers(home: Path) -> Iterator[tuple[str, Path, Callable[[], object]]]:
         yield tool, folder, lambda r=read, t=tool, s=source, k=known: r(t.split(":")[0], s, k)
 
 
-def read_pickles(home: Path, every: int, monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
-    """What became of bad pickles in place of each file of each reader's source."""
-    for name in made.COUNTS:
-        monkeypatch.setitem(BODY_MODELS, name, lambda _, name=name: Toy(name))
-    counts: Counter[str] = Counter()
-    mark = home / "mark"
-    bad = bad_pickles(mark)
-    for number, (tool, folder, read) in enumerate(readers(home)):
-        path = sorted(p for p in folder.rglob("*") if p.is_file())[0]
-        for name, content in list(bad.items())[number % every :: every]:
-            path.write_bytes(content)
-            with or_refused(counts, f"{tool}: {name}"):
-                read()
-                counts["taken"] += 1
-            assert not mark.exists(), (tool, name)
-    return counts
-
-
 @pytest.mark.filterwarnings("ignore:invalid value encountered:RuntimeWarning")  # the toy's sums
 @pytest.mark.parametrize(("every", "refused", "read"), [
     (5, 51, 51), pytest.param(1, 51, 25 * 15 + 1, marks=pytest.mark.slow),
 ])  # fmt: skip
 def test_bad_pickles_are_refused_by_every_reader(tmp_path, monkeypatch, every, refused, read):
-    counts = read_pickles(tmp_path, every, monkeypatch)
+    for name in made.COUNTS:
+        monkeypatch.setitem(BODY_MODELS, name, lambda _, name=name: Toy(name))
+    counts: Counter[str] = Counter()
+    mark = tmp_path / "mark"
+    bad = bad_pickles(mark)
+    for number, (tool, folder, reader) in enumerate(readers(tmp_path)):
+        path = sorted(p for p in folder.rglob("*") if p.is_file())[0]
+        for name, content in list(bad.items())[number % every :: every]:
+            path.write_bytes(content)
+            with or_refused(counts, f"{tool}: {name}"):
+                reader()
+                counts["taken"] += 1
+            assert not mark.exists(), (tool, name)
     assert counts["refused"] >= refused
     assert sum(counts.values()) >= read
 

@@ -28,8 +28,8 @@ QUICK = PrepareConfig(cells=24, faces=200, samples=50, region=10)
 
 
 @pytest.fixture
-def capture(tmp_path: Path) -> Capture:
-    return read_capture(tiny.write_capture(tmp_path / "tiny"))
+def capture(folder: Path) -> Capture:
+    return read_capture(folder)
 
 
 def elsewhere(piece: SceneObject, step: float) -> SceneObject:
@@ -58,24 +58,21 @@ def test_hypotheses_come_back_from_the_folder(capture: Capture, tmp_path: Path):
 
 def test_hypotheses_of_another_scene_are_left_out_and_reported(capture: Capture, tmp_path: Path):
     write_capture(with_others(capture), tmp_path / "out")
-    scene = json.loads((tmp_path / "out" / "scene.json").read_text())
-    scene["objects"][0]["translation"][0] += 0.5
-    (tmp_path / "out" / "scene.json").write_text(json.dumps(scene))
+    tiny.change(tmp_path / "out" / "scene.json", "objects.0.translation.0", -0.4)
     found = read_capture(tmp_path / "out")
     assert {p.id for p in found.hypotheses} == {capture.scene.objects[1].id}
     assert [w for w in found.warnings if "not of this scene" in w and "chair_0" in w]
 
 
-@pytest.mark.parametrize(("change", "words"), [
-    ({"format": "x"}, "format"),
-    ({"objects": []}, "objects"),
-    ({"objects": {"chair_0": [{}] * 17}}, "at most 16"),
-    ({"objects": {"chair_0": [{"translation": [0, 0], "yaw": 0}]}}, "translation"),
+@pytest.mark.parametrize(("field", "value", "words"), [
+    ("format", "x", "format"),
+    ("objects", [], "objects"),
+    ("objects", {"chair_0": [{}] * 17}, "at most 16"),
+    ("objects", {"chair_0": [{"translation": [0, 0], "yaw": 0}]}, "translation"),
 ])  # fmt: skip
-def test_wrong_fields_are_refused_by_name(capture, tmp_path, change, words):
+def test_wrong_fields_are_refused_by_name(capture, tmp_path, field, value, words):
     write_capture(with_others(capture), tmp_path / "out")
-    file = tmp_path / "out" / "hypotheses.json"
-    file.write_text(json.dumps({**json.loads(file.read_text()), **change}))
+    tiny.change(tmp_path / "out" / "hypotheses.json", field, value)
     with pytest.raises(InputError, match=words):
         read_capture(tmp_path / "out")
 

@@ -19,7 +19,7 @@ from mover.geometry.placement import place_in
 from mover.geometry.raster import Crops, Topology, look
 from mover.io.capture.folder import folder_parts, read_capture, write_capture
 from mover.io.capture.merge import import_into
-from mover.io.files.images import find_depth_file, read_depth, read_depth_image, reference_frame
+from mover.io.files.images import find_depth_file, read_depth, reference_frame
 from mover.stages.config import PlaceConfig
 from mover.stages.objects.gather_depth import DepthImageInputs, gather_depth
 from mover.stages.objects.place_inputs import coarser_image
@@ -135,8 +135,8 @@ def test_inverse_depth_may_be_an_array_or_a_grey_picture(tmp_path, capture):
     Image.fromarray(values.astype(np.uint8)).save(folder / "000000.png")
     np.savez(folder / "000001.npz", disparity=values.astype(np.float32))
     for name in ("000000.png", "000001.npz"):
-        found = read_depth_image(folder / name, camera, metric=False)
-        assert torch.equal(found.values, torch.from_numpy(values).float())
+        found = read_depth(folder / name, camera, metric=False)
+        assert torch.equal(found, torch.from_numpy(values).float())
     assert find_depth_file(tmp_path) == (folder / "000000.png", False)
 
 
@@ -197,4 +197,4 @@ def test_what_is_wrong_with_measured_depth_is_one_sentence(tmp_path, capture):
         ("a.npy", r"a\.npy: has 5 x 5 values"),
     ):
         with pytest.raises(InputError, match=words):
-            read_depth_image(tmp_path / name, camera, metric=False)
+            read_depth(tmp_path / name, camera, metric=False)

@@ -21,7 +21,7 @@ from mover.extensions.moved_furniture.stays import MoveInputs, find_moves
 from mover.geometry.placement import changes, mover_at, placed_at, standing_meshes
 from mover.geometry.rle import decode, encode
 from mover.geometry.rotations import rot_y, wrap
-from mover.io.capture.edits import Place, edit_scene, placement_of
+from mover.io.capture.edits import edit_scene, placement_of
 from mover.io.capture.folder import read_capture, write_capture
 from mover.io.capture.scene_file import read_scene, write_scene
 from mover_bench.experiment.measures import measure_moves
@@ -185,7 +185,7 @@ def test_a_turned_world_turns_the_segments(tmp_path: Path):
 
 def test_who_puts_an_object_elsewhere_puts_it_there_for_the_whole_video():
     scene = moved_room()
-    edited = edit_scene(scene, (Place("chair_0", placement_of(scene.objects[1], scene)),))
+    edited = edit_scene(scene, [placement_of(replace(scene.objects[1], id="chair_0"), scene)])
     assert edited.objects[0].segments == ()
 
 
@@ -202,8 +202,7 @@ def furniture(track: int = 0) -> dict[str, object]:
     }
 
 
-def test_a_capture_may_have_the_objects_masks_in_its_frames(tmp_path: Path):
-    folder = tiny.write_capture(tmp_path / "tiny")
+def test_a_capture_may_have_the_objects_masks_in_its_frames(folder: Path, tmp_path: Path):
     number = tiny.objects()["annotations"][0]["id"]
     (folder / "furniture.json").write_text(json.dumps(furniture(number)))
     capture = read_capture(folder)
@@ -218,8 +217,7 @@ def test_a_capture_may_have_the_objects_masks_in_its_frames(tmp_path: Path):
         read_capture(folder)
 
 
-def test_furniture_without_masks_is_reported(tmp_path: Path):
-    folder = tiny.write_capture(tmp_path / "tiny")
+def test_furniture_without_masks_is_reported(folder: Path):
     (folder / "furniture.json").write_text('{"images": [], "annotations": []}')
     capture = read_capture(folder)
     assert capture.furniture is None

@@ -17,7 +17,7 @@ from mover.io.capture.bodies_file import bodies_of, bodies_to_arrays
 from mover.io.capture.folder import read_capture, write_capture
 from mover.io.capture.merge import import_into, with_parts
 from mover.io.capture.parts import Parts
-from mover.io.capture.tracks import join_pieces, pair_tracks, paired
+from mover.io.capture.tracks import join_pieces, pair_tracks
 from mover.io.files.fields import At
 
 CAMERA = Camera(
@@ -32,11 +32,15 @@ Rows = list[tuple[int, int, tuple[float, float, float]]]
 """Frames, tracks and positions."""
 
 
+def numbers_of(rows: Rows) -> list[torch.Tensor]:
+    """Frames and tracks."""
+    return [torch.tensor([row[k] for row in rows]) for k in (0, 1)]
+
+
 def bodies_of_rows(rows: Rows) -> Bodies:
     """Boxes of a person's size, each a frame, a track and a position."""
     verts = torch.stack([CORNERS + torch.tensor(place) for _, _, place in rows])
-    frame, person = (torch.tensor([row[k] for row in rows]) for k in (0, 1))
-    return Bodies(verts, FACES, None, (), frame, person, 30.0, "camera", None)
+    return Bodies(verts, FACES, None, (), *numbers_of(rows), 30.0, "camera", None)
 
 
 def masks_of(rows: Rows, shown: float = 1.0) -> People:
@@ -48,8 +52,8 @@ def masks_of(rows: Rows, shown: float = 1.0) -> People:
         mask = torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.bool)
         mask[top : top + round(float(low - top) * shown), left:right] = True
         codes.append(encode(mask))
-    frame, person = (torch.tensor([row[k] for row in rows]) for k in (0, 1))
-    return People(Masks(CAMERA.height, CAMERA.width, tuple(codes)), frame, person, {"1": 1.8})
+    masks = Masks(CAMERA.height, CAMERA.width, tuple(codes))
+    return People(masks, *numbers_of(rows), {"1": 1.8})
 
 
 def walkers(first: int, second: int) -> Rows:
@@ -66,15 +70,21 @@ CASES = {  # numbers of bodies and masks: what the bodies' numbers and the masks
 }
 
 
+def changed(old: Bodies | People, new: Bodies | People) -> dict[int, int]:
+    """New numbers by old ones, where they differ."""
+    pairs = zip(old.person.tolist(), new.person.tolist(), strict=True)
+    return {one: other for one, other in pairs if one != other}
+
+
 @pytest.mark.parametrize("shown", [1.0, 0.5])
 @pytest.mark.parametrize("case", CASES)
 def test_tracks_of_two_tools_are_paired_by_position(case, shown):
     ours, theirs, of_bodies, of_masks = CASES[case]
     bodies, people = bodies_of_rows(walkers(*ours)), masks_of(walkers(*theirs), shown)
-    pairs = pair_tracks(bodies, people, CAMERA)
-    assert (pairs.bodies, pairs.masks) == (of_bodies, of_masks)
-    assert len(pairs.notes) == bool(of_masks)
-    found, masks = paired(bodies, people, pairs)
+    found, masks, notes = pair_tracks(bodies, people, CAMERA)
+    assert changed(bodies, found) == of_bodies
+    assert changed(people, masks) == of_masks
+    assert len(notes) == bool(of_masks)
     assert torch.equal(masks.person, bodies.person)
     assert torch.equal(found.person, bodies.person)
     assert masks.heights == {str(of_masks.get(1, 1)): 1.8}
@@ -83,11 +93,12 @@ def test_tracks_of_two_tools_are_paired_by_position(case, shown):
 def test_pieces_are_one_person_where_the_other_side_is_whole():
     rows, cut = walkers(0, 1), in_pieces()
     bodies, people = bodies_of_rows(cut), replace(masks_of(rows), heights={"9": 1.7, "1": 1.8})
-    pairs = pair_tracks(bodies, people, CAMERA)
-    assert (pairs.bodies, pairs.masks) == ({9: 0}, {})
-    assert paired(bodies, people, pairs)[1].heights == {"0": 1.7, "1": 1.8}
-    pairs = pair_tracks(bodies_of_rows(rows), masks_of(cut), CAMERA)
-    assert (pairs.bodies, pairs.masks) == ({}, {9: 0})
+    found, masks, _ = pair_tracks(bodies, people, CAMERA)
+    assert (changed(bodies, found), changed(people, masks)) == ({9: 0}, {})
+    assert masks.heights == {"0": 1.7, "1": 1.8}
+    bodies, people = bodies_of_rows(rows), masks_of(cut)
+    found, masks, _ = pair_tracks(bodies, people, CAMERA)
+    assert (changed(bodies, found), changed(people, masks)) == ({}, {9: 0})
 
 
 def in_pieces() -> Rows:
@@ -124,14 +135,15 @@ def test_what_is_uncertain_keeps_its_number():
     """Two people close together under other numbers; and a mask elsewhere whose number is used."""
     near = [(f, p, (0.05 * p, 0.0, 3.5)) for f in FRAMES for p in (0, 1)]
     others = [(f, p + 5, place) for f, p, place in near]
-    assert pair_tracks(bodies_of_rows(near), masks_of(others), CAMERA).notes == ()
+    assert pair_tracks(bodies_of_rows(near), masks_of(others), CAMERA)[2] == ()
     alone = [(f, 0, (1.0, 0.0, 4.0)) for f in FRAMES]
     elsewhere = [(f, 0, (-1.2, 0.0, 5.0)) for f in FRAMES]
     elsewhere += [(f, 4, place) for f, _, place in alone]
-    pairs = pair_tracks(bodies_of_rows(alone), masks_of(elsewhere), CAMERA)
-    assert (pairs.bodies, pairs.masks) == ({}, {4: 0, 0: 5})
-    apart = replace(bodies_of_rows(alone), frame=torch.arange(100, 100 + len(FRAMES)))
-    assert pair_tracks(apart, masks_of(elsewhere), CAMERA).notes == ()
+    bodies, people = bodies_of_rows(alone), masks_of(elsewhere)
+    found, masks, _ = pair_tracks(bodies, people, CAMERA)
+    assert (changed(bodies, found), changed(people, masks)) == ({}, {4: 0, 0: 5})
+    apart = replace(bodies, frame=torch.arange(100, 100 + len(FRAMES)))
+    assert pair_tracks(apart, people, CAMERA)[2] == ()
 
 
 def walk(spans: dict[int, range], step: float = 0.02) -> tuple[torch.Tensor, ...]:

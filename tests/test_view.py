@@ -253,7 +253,7 @@ class TestReplay:
         piece = nearest(scene)
         shift = torch.tensor([0.3, 0.0, -0.2])
         put = dataclasses.replace(piece, t_world_object=piece.t_world_object + shift)
-        edits = (Place(piece.id, placement_of(put, scene)), Pin(piece.id, True))
+        edits = (placement_of(put, scene), Pin(piece.id, True))
         write_edits(edits, tmp_path / "edits.json")
         for name in ("a", "b"):
             call("run", folder / "capture", "--out", tmp_path / name, "--config",

@@ -20,7 +20,6 @@ from mover.io.capture.edits import (
     Delete,
     Pin,
     Place,
-    Placement,
     apply_edits,
     edit_scene,
     joined,
@@ -31,13 +30,13 @@ from mover.io.capture.edits import (
 from mover.stages.objects.place_inputs import Pinned, hold
 
 
-def at(x=0.5, z=-2.0, yaw=1.0, scale=(1.0, 1.1, 0.9), pitch=-0.2, roll=0.0):
-    return Placement((x, GROUND, z), yaw, scale, pitch=pitch, roll=roll)
+def put(name, x=0.5, z=-2.0, yaw=1.0, scale=(1.0, 1.1, 0.9), pitch=-0.2, roll=0.0):
+    return Place(name, (x, GROUND, z), yaw, scale, pitch=pitch, roll=roll)
 
 
 def every_edit():
     return (
-        Place("chair_0", at()), Pin("chair_0", True), Pin("table_0", True), Delete("sofa_0"),
+        put("chair_0"), Pin("chair_0", True), Pin("table_0", True), Delete("sofa_0"),
         Pin("table_0", False),
     )  # fmt: skip
 
@@ -81,9 +80,9 @@ class TestEdits:
     @given(st.floats(-0.5, 0.1), st.floats(-0.1, 0.1), st.floats(-3, 3))
     @settings(max_examples=25, deadline=None)
     def test_a_place_of_another_camera_keeps_its_box_in_the_camera_frame(self, pitch, roll, yaw):
-        put = at(yaw=yaw, pitch=-0.2, roll=0.02)
-        here = edit_scene(under(room(), -0.2, 0.02), [Place("chair_0", put)])
-        there = edit_scene(under(room(), pitch, roll), [Place("chair_0", put)])
+        place = put("chair_0", yaw=yaw, pitch=-0.2, roll=0.02)
+        here = edit_scene(under(room(), -0.2, 0.02), [place])
+        there = edit_scene(under(room(), pitch, roll), [place])
         centers = [
             to_camera(box_of(by_id(s)["chair_0"]).center, s.camera.R_cam_world)
             for s in (here, there)
@@ -92,7 +91,7 @@ class TestEdits:
         seen = by_id(there)["chair_0"].yaw[None]
         level = Layout(torch.zeros(1, 3), seen, torch.zeros(1, 3))
         back = reproject(level, torch.zeros(1), there.camera.R_cam_world, here.camera.R_cam_world)
-        assert float(wrap(back.yaw[0] - put.yaw).abs()) < 1e-5
+        assert float(wrap(back.yaw[0] - place.yaw).abs()) < 1e-5
 
     def test_what_a_deleted_object_carried_stands_where_it_stood(self):
         pieces = list(room().objects)
@@ -101,14 +100,14 @@ class TestEdits:
         scene = edit_scene(dataclasses.replace(room(), objects=tuple(pieces)), [Delete("table_0")])
         assert by_id(scene)["chair_0"].support == "sofa_0"
 
-    @pytest.mark.parametrize("edit", [Delete("lamp_0"), Pin("lamp_0", True), Place("lamp_0", at())])
+    @pytest.mark.parametrize("edit", [Delete("lamp_0"), Pin("lamp_0", True), put("lamp_0")])
     def test_that_do_not_fit_are_named(self, edit):
         said = r"edits\[1\] has 'lamp_0', expected an object of the scene: chair_0, sofa_0"
         with pytest.raises(InputError, match=said):
             edit_scene(room(), [Pin("chair_0", True), edit])
 
     def test_placements_of_one_object_in_a_row_are_one(self):
-        first, second, other = Place("a", at(0)), Place("a", at(1)), Place("b", at(2))
+        first, second, other = put("a", 0.0), put("a", 1.0), put("b", 2.0)
         assert joined((first,), second) == (second,)
         assert joined((first, other), second) == (first, other, second)
 

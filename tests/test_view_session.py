@@ -44,7 +44,7 @@ def test_every_change_is_on_disk_and_an_undo_takes_it_back(tmp_path: Path):
 def test_edits_of_a_run_are_inside_of_its_result_and_new_ones_do_not_replace_them(tmp_path: Path):
     first = room()
     put = dataclasses.replace(first.objects[0], t_world_object=torch.tensor([0.1, GROUND, -2.0]))
-    edits = (Delete("sofa_0"), Place(put.id, placement_of(put, first)))
+    edits = (Delete("sofa_0"), placement_of(put, first))
     write_edits(edits, tmp_path / "edits.json")
     rest = tuple(put if o.id == put.id else o for o in first.objects if o.id != "sofa_0")
     solved = shown(dataclasses.replace(first, objects=rest), edits=2)

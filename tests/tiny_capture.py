@@ -165,6 +165,13 @@ def put(tree: Any, way: Sequence[Any], value: Any) -> None:
         tree[last] = value
 
 
+def change(file: Path, path: str, value: Any) -> None:
+    """Set the field `a.0.b` of a JSON file; `...` deletes it."""
+    tree = json.loads(file.read_text())
+    put(tree, [int(key) if key.isdigit() else key for key in path.split(".")], value)
+    file.write_text(json.dumps(tree))
+
+
 def ways_of(tree: Any, way: tuple[Any, ...] = (), most: int = 10**9) -> list[tuple[Any, ...]]:
     """The way to every value in lists and objects; in lists of `most` items only to the ends."""
     found = [way] if way else []

@@ -92,7 +92,7 @@ class Session:
             torch.allclose(getattr(old, key), getattr(moved, key), atol=1e-5)
             for key in ("t_world_object", "yaw", "scale")
         ):
-            self.record(editing.Place(moved.id, editing.placement_of(moved, self.shown.result)))
+            self.record(editing.placement_of(moved, self.shown.result))
 
     def pin(self, name: str, pinned: bool) -> None:
         """Fix an object at its present position, or let runs move it again."""
@@ -100,7 +100,7 @@ class Session:
         if item is None or pinned == (name in self.pinned):
             return
         if pinned:
-            self.record(editing.Place(name, editing.placement_of(item, self.shown.result)))
+            self.record(editing.placement_of(item, self.shown.result))
         self.record(editing.Pin(name, pinned))
 
     def delete(self, name: str) -> None:

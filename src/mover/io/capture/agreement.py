@@ -2,8 +2,9 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
+from operator import attrgetter
 
 import torch
 from jaxtyping import Float, Int
@@ -49,9 +50,7 @@ class Agreement:
 
 
 NOTHING = Agreement(*[torch.zeros(0)] * 8, boxes=torch.zeros(0, 4))
-SCORES = (
-    "objects", "sizes", "turns", "object_masks", "people_masks", "people", "heights", "upright",
-)  # fmt: skip
+SCORES = [field.name for field in fields(Agreement) if field.name != "boxes"]
 
 
 def thinned_capture(capture: Capture) -> Capture:
@@ -95,14 +94,17 @@ def agreement(capture: Capture, other: tuple[Capture, Agreement] | None = None) 
     """How well the parts of a thinned capture agree; what is as in another is taken from it."""
     scene, bodies, people = capture.scene, capture.bodies, capture.people
     before, found = other or (None, NOTHING)
-    new_camera = before is None or scene.camera is not before.scene.camera
-    new_masks = before is None or capture.detections is not before.detections
-    if before is None or new_masks or scene is not before.scene:
+
+    def is_new(*parts: str) -> bool:
+        reads = map(attrgetter, parts)
+        return before is None or any(read(capture) is not read(before) for read in reads)
+
+    if is_new("scene", "detections"):
         found = replace(
             found, objects=_overlaps(capture), sizes=_usual_sizes(scene.objects),
             turns=torch.tensor([float(abs(float(x.yaw)) < FULL_TURN) for x in scene.objects]),
         )  # fmt: skip
-    if before is None or new_masks or people is not before.people:
+    if is_new("detections", "people"):
         people_masks = [] if people is None or not len(people.frame) else [people.masks]
         object_masks = [d.mask for d in capture.detections if d.mask is not None]
         found = replace(
@@ -110,16 +112,13 @@ def agreement(capture: Capture, other: tuple[Capture, Agreement] | None = None) 
         )
     if bodies is None:
         return found
-    new_bodies = before is None or bodies is not before.bodies
-    if new_camera or before is None or before.bodies is None or (
-        bodies.verts is not before.bodies.verts
-    ):  # fmt: skip
+    if is_new("scene.camera", "bodies.verts"):
         tall = (bodies.verts.amax(1) - bodies.verts.amin(1)).amax(-1)
         found = replace(
             found, boxes=box_around(bodies.verts, scene.camera),
             heights=_within(tall, *HEIGHTS), upright=_upright(bodies, scene.camera),
         )  # fmt: skip
-    if new_camera or new_bodies or before is None or people is not before.people:
+    if is_new("scene.camera", "bodies", "people"):
         boxes = in_image(found.boxes, scene.camera)
         found = replace(found, people=_on_masks(boxes, bodies, people))
     return found
@@ -127,16 +126,23 @@ def agreement(capture: Capture, other: tuple[Capture, Agreement] | None = None) 
 
 def _overlaps(capture: Capture) -> Float[Tensor, " annotated"]:
     """Overlaps of outlines and annotations; where no object has one, those of the best pairs."""
-    objects, boxes = capture.scene.objects, {d.id: d.box for d in capture.detections}
-    if not boxes or not objects:
+    objects, camera = capture.scene.objects, capture.scene.camera
+    if not capture.detections or not objects:
         return torch.zeros(0)
-    known = {i: boxes[key] for i, one in enumerate(objects)
-             if (key := one.annotation) is not None and key in boxes}  # fmt: skip
-    ours = in_image(outlines(objects, capture.scene.camera), capture.scene.camera)
+    known, boxes = annotated(capture)
+    ours = in_image(outlines(known or objects, camera), camera)
     if known:
-        return iou2d(ours[list(known)], torch.stack(list(known.values())))
-    shared = pairwise_iou2d(ours, torch.stack(list(boxes.values())))
+        return iou2d(ours, boxes)
+    shared = pairwise_iou2d(ours, torch.stack([d.box for d in capture.detections]))
     return torch.stack([shared[pair] for pair in assigned(shared)])
+
+
+def annotated(capture: Capture) -> tuple[list[SceneObject], Float[Tensor, "objects 4"]]:
+    """The objects that have an annotation, and its boxes."""
+    boxes = {d.id: d.box for d in capture.detections}
+    known = [one for one in capture.scene.objects if one.annotation in boxes]
+    theirs = [boxes[key] for one in known if (key := one.annotation) is not None]
+    return known, torch.stack(theirs) if theirs else torch.zeros(0, 4)
 
 
 def pairwise_iou2d(
@@ -228,11 +234,11 @@ def _on_masks(
 
 
 def partners(
-    frame: Int[Tensor, "*rows"], person: Int[Tensor, "*rows"], people: People
+    frame: Int[Tensor, "*rows"], person: Int[Tensor, "*rows"], others: People | Bodies
 ) -> Int[Tensor, "*rows"]:
-    """Row of the mask of a person in a frame, -1: none."""
-    wide = 1 + max(int(person.max()), int(people.person.max()))
-    ours, theirs = frame * wide + person, people.frame * wide + people.person
+    """Row of the mask, or body, of a person in a frame, -1: none."""
+    wide = 1 + max(int(person.max()), int(others.person.max()))
+    ours, theirs = frame * wide + person, others.frame * wide + others.person
     order = theirs.argsort()
     row = order[torch.searchsorted(theirs[order], ours).clamp_max(len(order) - 1)]
     return torch.where(theirs[row] == ours, row, torch.full_like(row, -1))

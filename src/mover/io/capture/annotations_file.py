@@ -50,8 +50,7 @@ def detections_of(at: At, camera: Camera, warn: Warn) -> tuple[Detection, ...]:
         score = 1.0 if row.score is None else row.score
         found.append(Detection(row.id, category, box, mask, score))
         unique(item.get("id"), known, row.id, "an id")
-    bare = [d.id for d in found if d.mask is None]
-    if bare:
+    if bare := [d.id for d in found if d.mask is None]:
         warn(f"{at.file}: {listed('annotation', bare)} without segmentation, only the box counts")
     return tuple(found)
 
@@ -114,8 +113,6 @@ class PeopleFile:
     people: People | None
     reference: Masks | None
     fps: float | None
-    frames: frozenset[int]
-    """Frames that were looked at, with people or without."""
 
 
 Height = Annotated[float, Meta(ge=0.3, le=3.0)]
@@ -171,7 +168,7 @@ def people_of(at: At, camera: Camera, warn: Warn) -> PeopleFile:
     if lost := len(found) - len(reference):
         warn(f"{at.file}: {lost} people of the reference image without mask")
     hidden = joined(reference) if reference else None
-    return PeopleFile(people, hidden, known.fps, frozenset(frames))
+    return PeopleFile(people, hidden, known.fps)
 
 
 def _masks_of(
@@ -193,11 +190,7 @@ def _masks_of(
 def furniture_of(
     at: At, camera: Camera, detections: tuple[Detection, ...], warn: Warn
 ) -> People | None:
-    """The objects' visible masks in some frames; tracks are numbers of annotations.
-
-    Raises:
-        InputError: If a field is wrong, or a track is no annotation of objects.json.
-    """
+    """The objects' visible masks in some frames; tracks are ids of annotations in objects.json."""
     found = people_of(at, camera, warn).people
     known = {detection.id for detection in detections}
     for item in at.get("annotations").items():

@@ -160,15 +160,14 @@ def _masks(value: Numbers, field: str, axes: str) -> Tensor:
 
 def _people(people: PeopleArrays) -> dict[str, Any]:
     """The content of people.json."""
-    masks, hidden = _coded(people.masks, "people.masks"), None
+    masks, hidden = _coded(people.masks, "people.masks"), people.reference
     frame, person = (
         torch.from_numpy(At(np.asarray(value), FILE, f"people.{name}").indices(len(masks.counts)))
         for name, value in (("frame", people.frame), ("person", people.person))
     )
-    if people.reference is not None:
-        hidden = _coded(people.reference, "people.reference")
+    reference = None if hidden is None else _coded(hidden, "people.reference")
     heights = {} if people.heights is None else At(people.heights, FILE, "people.heights").mapping()
-    tree = people_to_json(People(masks, frame, person, {}), hidden, None, ())
+    tree = people_to_json(People(masks, frame, person, {}), reference, None, ())
     return {**tree, "info": {"heights": heights}}
 
 

@@ -34,11 +34,7 @@ def read_bodies(path: Path, warn: Warn = log.warning) -> Bodies:
 
 
 def read_body_arrays(path: Path, fps: float | None = None) -> At:
-    """The arrays of bodies.npz as they are, with a frame rate where one is given.
-
-    Raises:
-        InputError: If it cannot be read.
-    """
+    """The arrays of bodies.npz as they are, with a frame rate where one is given."""
     if path.is_dir() or path.suffix.lower() not in (".npz", ""):
         cure = f"name the tool that wrote it (--bodies-from {', '.join(names('people'))})"
         raise InputError(f"{named(path).name}: is no bodies.npz; {cure}")
@@ -68,7 +64,7 @@ def bodies_of(at: At, warn: Warn) -> Bodies:
             joints = _places(at.get("joints"), (len(frame), "J", 3))
             names = tuple(map(str, at.get("joint_names").array((joints.shape[1],), "text")))
     space = at.get("space")
-    word: Any = At(str(space.array((), "text")), at.file, space.field).choice(("camera", "world"))
+    word: Any = space.holding(str(space.array((), "text"))).choice(("camera", "world"))
     spread = scalar(at, "size_spread", 0.0, 1.0)
     mean_shape = pose is not None and has_mean_shape(pose)  # before a pose is dropped unchecked
     fps = scalar(at, "fps", SLOWEST, FASTEST)

@@ -16,21 +16,16 @@ from mover.io.capture.parts import Parts
 from mover.io.capture.plausible import check_plausible
 from mover.io.capture.pose_file import into_camera
 from mover.io.capture.scene_file import hypotheses_of, scene_of
-from mover.io.capture.tracks import pair_tracks, paired
+from mover.io.capture.tracks import pair_tracks
 from mover.io.files.fields import At, Warn, listed
 from mover.io.files.schema import checked
 
 SLOW, FAST = 2.0, 250.0  # frames a second, of usual videos
 SAME_RATE = 0.01  # relative difference of two rates that are one
-NO_PEOPLE = PeopleFile(None, None, None, frozenset())
 
 
 def build_capture(parts: Parts) -> Capture:
-    """Check everything that is known of a capture and build it; there is no other way to one.
-
-    Raises:
-        InputError: If anything is wrong, or camera, scene or objects are missing.
-    """
+    """Check everything that is known of a capture and build it; there is no other way to one."""
     if parts.camera is None or parts.scene is None or parts.objects is None:
         lacking = [f"{n}.json" for n in ("camera", "scene", "objects") if not getattr(parts, n)]
         raise InputError(f"{parts.name}: has no {lacking[0]}, expected one (see `mover import`)")
@@ -43,22 +38,22 @@ def build_capture(parts: Parts) -> Capture:
              "give one in both")  # fmt: skip
     detections = detections_of(parts.objects, camera, warn)
     _check_annotations(parts.scene, parts.objects.file, scene, detections, warn)
-    people = people_of(parts.people, camera, warn) if parts.people else NO_PEOPLE
+    none = PeopleFile(None, None, None)
+    people = people_of(parts.people, camera, warn) if parts.people else none
     bodies = _bodies_of(parts.bodies, camera, turn, people.fps, warn)
     touch = None
     if parts.contacts is not None and bodies is not None:
         touch = read_touch(parts.contacts, bodies)
     elif parts.contacts is not None:
         warn("contacts.npz: there are no bodies, so it is not used")
-    _check_frames(parts, people, bodies)
+    _check_frames(parts, bodies)
     bodies, people = _same_people(bodies, people, camera, warn)
-    others, furniture, path = (), None, STILL
-    if parts.hypotheses is not None:
-        others = hypotheses_of(parts.hypotheses, parts.load_mesh, scene, warn)
+    given, path = parts.hypotheses, STILL
+    others = hypotheses_of(given, parts.load_mesh, scene, warn) if given else ()
     if parts.load_image is None:
         warn(f"{parts.no_image}: there is no picture to draw on")
-    if parts.furniture is not None:
-        furniture = furniture_of(parts.furniture, camera, detections, warn)
+    given = parts.furniture
+    furniture = furniture_of(given, camera, detections, warn) if given else None
     if parts.cameras is not None:
         path = path_of(parts.cameras, camera, bodies, warn)
         space = None if parts.bodies is None or is_still(path) else parts.bodies.get("space")
@@ -129,10 +124,9 @@ def _same_people(
         return bodies, people
     if bodies is None:
         return bodies, people
-    pairs = pair_tracks(bodies, people.people, camera)
-    for note in pairs.notes:
+    bodies, masks, notes = pair_tracks(bodies, people.people, camera)
+    for note in notes:
         warn(note)
-    bodies, masks = paired(bodies, people.people, pairs)
     shown, rows = (
         set(zip(one.frame.tolist(), one.person.tolist(), strict=True)) for one in (masks, bodies)
     )
@@ -143,7 +137,7 @@ def _same_people(
     return bodies, dataclasses.replace(people, people=masks)
 
 
-def _check_frames(parts: Parts, people: PeopleFile, bodies: Bodies | None) -> None:
+def _check_frames(parts: Parts, bodies: Bodies | None) -> None:
     """No frame lies behind the end of the video."""
     count = parts.n_frames
     if count is None:
@@ -151,5 +145,7 @@ def _check_frames(parts: Parts, people: PeopleFile, bodies: Bodies | None) -> No
     expected = f"a frame from 0 to {count - 1}, as frames/ has {count}"
     if bodies is not None and parts.bodies is not None and bodies.frame.max() >= count:
         parts.bodies.get("frame").refuse(expected, f"{int(bodies.frame.max())}")
-    if people.frames and parts.people is not None and max(people.frames) >= count:
-        parts.people.get("images").refuse(expected, f"{max(people.frames)}")
+    images = [] if parts.people is None else parts.people.get("images").items()
+    last = max((image.get("id").value for image in images), default=-1)
+    if parts.people is not None and last >= count:
+        parts.people.get("images").refuse(expected, f"{last}")

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import torch
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, to_builtins
 from numpy.typing import NDArray
 
 from mover.core.types import STILL, Bodies, Camera, CameraPath
@@ -21,7 +21,7 @@ NO_TURN = 1e-6  # [rad]
 LEVEL = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
 
 
-class CameraFields(Struct, frozen=True):
+class CameraFields(Struct, frozen=True, omit_defaults=True):
     """camera.json, and `camera` of scene.json; lengths in pixels, the height above the floor [m].
 
     The spread is the standard deviation of the logarithm of the focal length; `focal_by_lines`
@@ -83,14 +83,10 @@ def check_attitude(camera: Camera, place: str, warn: Warn) -> None:
         warn(f"{place}: the camera is turned on its side or head (roll {roll:.2f} rad); {axes}")
 
 
-def camera_to_json(camera: Camera) -> dict[str, Any]:
-    """The JSON object of a camera."""
-    K = plain(camera.K)
-    return {
-        "w": camera.width, "h": camera.height,
-        "fl_x": K[0][0], "fl_y": K[1][1], "cx": K[0][2], "cy": K[1][2],
-        "R_cam_world": plain(camera.R_cam_world),
-    }  # fmt: skip
+def camera_to_json(camera: Camera, **more: Any) -> dict[str, Any]:  # noqa: ANN401
+    """The JSON object of a camera; `more` are the other fields of `CameraFields`."""
+    K, R, size = plain(camera.K), plain(camera.R_cam_world), (camera.width, camera.height)
+    return to_builtins(CameraFields(*size, K[0][0], K[1][1], K[0][2], K[1][2], R, **more))
 
 
 # cameras.npz: where a moving camera was in the frames, in any world and any scale.

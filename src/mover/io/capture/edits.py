@@ -7,7 +7,7 @@ of that world stands in the edit, so that it can be carried to any other estimat
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float
@@ -22,8 +22,12 @@ from mover.io.files.fields import plain, read_json, write_json
 from mover.io.files.schema import Number, Sizes, Vector, checked
 
 
-class Placement(Struct, frozen=True):
-    """The pose of an object: x_world = R_y(yaw) @ (scale * x_mesh) + translation."""
+class _Edit(Struct, frozen=True, tag_field="do"):
+    id: str
+
+
+class Place(_Edit, frozen=True, tag="place"):
+    """Move, turn or resize an object: x_world = R_y(yaw) @ (scale * x_mesh) + translation."""
 
     translation: Vector
     """Position of the mesh origin [m]."""
@@ -35,16 +39,6 @@ class Placement(Struct, frozen=True):
     """Of the camera in whose world this is [rad]."""
     roll: Annotated[float, Meta(ge=-3.2, le=3.2)]
     """[rad]."""
-
-
-class _Edit(Struct, frozen=True, tag_field="do"):
-    id: str
-
-
-class Place(_Edit, frozen=True, tag="place"):
-    """Move, turn or resize an object."""
-
-    at: Placement
 
 
 class Pin(_Edit, frozen=True, tag="pin"):
@@ -65,15 +59,11 @@ class EditsFields(Struct, frozen=True):
 
     format: Literal["mover-edits"]
     version: Literal[1]
-    edits: list[Any]
+    edits: list[Edit]
 
 
 def apply_edits(capture: Capture, edits: Sequence[Edit]) -> tuple[Capture, tuple[str, ...]]:
-    """The capture with its initial scene edited, and the ids of the pinned objects.
-
-    Raises:
-        InputError: If an edit names an object that is not there.
-    """
+    """The capture with its initial scene edited, and the ids of the pinned objects."""
     scene = edit_scene(capture.scene, edits)
     return replace(capture, scene=scene), pinned_ids(scene, edits)
 
@@ -91,10 +81,10 @@ def edit_scene(scene: Scene, edits: Sequence[Edit]) -> Scene:
             found = f"edits[{index}] has {edit.id!r}"
             raise InputError(f"{found}, expected an object of the scene: {known}")
         if isinstance(edit, Place):
-            at, new = edit.at, scene.camera.R_cam_world
-            t, yaw, scale = (torch.tensor(x).float() for x in (at.translation, at.yaw, at.scale))
+            given = (edit.translation, edit.yaw, edit.scale)
+            t, yaw, scale = (torch.tensor(value).float() for value in given)
             put = replace(objects[edit.id], t_world_object=t, yaw=yaw, scale=scale, segments=())
-            old = tilted(torch.tensor(at.pitch), torch.tensor(at.roll))
+            old, new = tilted(*torch.tensor([edit.pitch, edit.roll])), scene.camera.R_cam_world
             # The front is the level direction that `recast` turns back into the edit's: a pinned
             # object returns exactly when a run finds that camera.
             front, up_old, up_new = old @ facing(yaw), old[:, 1], new[:, 1]
@@ -113,11 +103,11 @@ def pinned_ids(scene: Scene, edits: Sequence[Edit]) -> tuple[str, ...]:
     return tuple(one.id for one in scene.objects if pinned.get(one.id, False))
 
 
-def placement_of(one: SceneObject, scene: Scene) -> Placement:
-    """The pose of an object of a scene, as an edit holds it."""
+def placement_of(one: SceneObject, scene: Scene) -> Place:
+    """The edit that puts an object where it is in a scene."""
     pitch, roll = pitch_roll(scene.camera.R_cam_world)
     t, yaw, scale = (plain(x) for x in (one.t_world_object, one.yaw, one.scale))
-    return Placement(tuple(t), yaw, tuple(scale), float(pitch), float(roll))
+    return Place(one.id, tuple(t), yaw, tuple(scale), float(pitch), float(roll))
 
 
 def joined(edits: Sequence[Edit], new: Edit) -> tuple[Edit, ...]:
@@ -148,19 +138,9 @@ def carried(
 
 def read_edits(path: Path) -> tuple[Edit, ...]:
     """Read and check a list of edits; whether their objects exist is checked when they apply."""
-    at, found = read_json(path), list[Edit]()
-    checked(at, EditsFields)
-    for item in at.get("edits").items():
-        row = item.mapping()
-        if row.get("do") == "place":  # its row has the fields of the placement
-            checked(item, Placement)
-            row = {**row, "at": row}
-        found.append(checked(item.holding(row), Edit))
-    return tuple(found)
+    return tuple(checked(read_json(path), EditsFields).edits)
 
 
 def write_edits(edits: tuple[Edit, ...], path: Path) -> None:
     """Write the list, all at once."""
-    rows: list[dict[str, Any]] = [to_builtins(edit) for edit in edits]
-    flat = [{k: v for k, v in (row | row.get("at", {})).items() if k != "at"} for row in rows]
-    write_json({"format": "mover-edits", "version": 1, "edits": flat}, path)
+    write_json(to_builtins(EditsFields("mover-edits", 1, list(edits))), path)

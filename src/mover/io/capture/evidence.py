@@ -16,6 +16,7 @@ from mover.core.types import Bodies, Camera, Capture, Masks
 from mover.energy.human_terms import eroded
 from mover.geometry.camera import NEAR, project
 from mover.geometry.rle import area, decode, thinned
+from mover.io.capture.agreement import partners
 
 FEWEST = 5  # touching vertices inside a mask that make a frame with contact
 UNSURE = 0.5  # chance from which on a vertex touches
@@ -77,25 +78,25 @@ def passing_people(
 ) -> tuple[list[int], list[int], list[int]]:
     """Of each object: pixels where people stand before it, where it hides them, and frames."""
     camera, people, bodies = capture.scene.camera, capture.people, capture.bodies
+    if people is None:
+        return [0] * len(masks), [0] * len(masks), [0] * len(masks)
     step = max(1, camera.width // CELLS)
     shape = len(range(step // 2, camera.height, step)), len(range(step // 2, camera.width, step))
     grids = np.stack([np.zeros(shape, np.bool_) if m is None else thinned(m, 0, step)
                       for m in masks]) if masks else np.zeros((0, *shape), np.bool_)  # fmt: skip
     near, far, frames = np.zeros_like(grids), np.zeros_like(grids), [set[int]() for _ in masks]
     covers = grids.reshape(len(masks), shape[0] * shape[1]).astype(np.float32)
-    rows: dict[tuple[int, int], int] = {}
+    rows = [-1] * len(people.frame)
     if bodies is not None:
-        pairs = zip(bodies.frame.tolist(), bodies.person.tolist(), strict=True)
-        rows = {pair: row for row, pair in enumerate(pairs)}
-    for frame in [] if people is None else people.frame.unique().tolist():
-        assert people is not None
+        rows = partners(people.frame, people.person, bodies).tolist()
+    for frame in people.frame.unique().tolist():
         shown = (people.frame == frame).nonzero()[:, 0].tolist()
         visible = [thinned(people.masks, i, step) for i in shown]
         hidden = _shrunk(~np.any(visible, axis=0))
         for i, own in zip(shown, visible, strict=True):
-            row, layers = rows.get((frame, int(people.person[i]))), [own]
-            if bodies is not None and row is not None:
-                body = _silhouette(bodies, row, camera, step)
+            layers = [own]
+            if bodies is not None and rows[i] >= 0:
+                body = _silhouette(bodies, rows[i], camera, step)
                 layers += [own & body, _shrunk(body) & hidden]
             shares = covers @ np.stack(layers).reshape(len(layers), -1).T  # whole numbers of cells
             for k in np.flatnonzero(shares[:, 0]):

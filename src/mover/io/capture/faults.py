@@ -134,9 +134,9 @@ def _unexplained(thin: Capture, found: agree.Agreement) -> Iterator[str]:
     rows, both = int((~found.people.isnan()).sum()), "(mean overlap in the picture {:.2f})"
     if not len(found.objects) and not rows:
         yield "nothing could be held against the picture: no object or body has a box or a mask"
-    known = {one.id for one in thin.detections}
-    named = [one.id for one in thin.scene.objects if one.annotation in known]
-    away = [name for name, one in zip(named, found.objects, strict=False) if float(one) < MISSED]
+    known, _ = agree.annotated(thin)
+    scores = zip(known, found.objects, strict=False)
+    away = [one.id for one, score in scores if float(score) < MISSED]
     if len(found.objects) > 1 and mean(found.objects) < POOR_OBJECTS:
         missed = f"scene.json: the objects miss their annotations {both}".format
         yield f"{missed(mean(found.objects))}; are scene, camera and picture of one room?"
@@ -265,23 +265,12 @@ def _swaps(capture: Capture, found: agree.Agreement) -> Iterator[Fault]:
     yield Fault(name, cure, mends.by_masks, MARGIN + SAME)
 
 
-def _views(capture: Capture) -> tuple[list[int], Float[Tensor, "n 4"], Float[Tensor, "n 4"]]:
-    """Objects with an annotation, their outlines and the annotation's boxes."""
-    objects, known = capture.scene.objects, {d.id: d.box for d in capture.detections}
-    rows = [i for i, one in enumerate(objects) if one.annotation in known]
-    if not rows:
-        return [], torch.zeros(0, 4), torch.zeros(0, 4)
-    theirs = torch.stack([known[key] for i in rows if (key := objects[i].annotation) is not None])
-    return rows, agree.outlines([objects[i] for i in rows], capture.scene.camera), theirs
-
-
 def _annotations(capture: Capture, found: agree.Agreement) -> Iterator[Fault]:
     """Annotations that objects of one class have exchanged."""
     del found
-    known, ours, theirs = _views(capture)
-    ours = agree.in_image(ours, capture.scene.camera)
-    some = [capture.scene.objects[i] for i in known]
+    (some, theirs), camera = agree.annotated(capture), capture.scene.camera
     kinds = [canonical(one.category) for one in some]
+    ours = agree.in_image(agree.outlines(some, camera), camera)
     shared = agree.pairwise_iou2d(ours, theirs)
     shared = shared * torch.tensor([[float(a == b) for b in kinds] for a in kinds])
     pairs = agree.assigned(shared, POOR) if len(some) > 1 else []
@@ -296,7 +285,8 @@ def _annotations(capture: Capture, found: agree.Agreement) -> Iterator[Fault]:
 def _lenses(capture: Capture, found: agree.Agreement) -> Iterator[Fault]:
     """Outlines fit boxes that are scaled and moved: another lens, another size, a crop."""
     camera, bodies, people = capture.scene.camera, capture.bodies, capture.people
-    _, ours, theirs = _views(capture)
+    some, theirs = agree.annotated(capture)
+    ours = agree.outlines(some, camera)
     k, _, _ = _fitted(ours, theirs, camera, (ours[:, :2] + ours[:, 2:]) / 2)
     what = f"{1 / k:.2g} times too large" if k < 1 else f"{k:.2g} times too small"
     mend, cure = partial(mends.each, mends.scaled(k, 1)), f"multiply 'scale' by {k:.2g}"
@@ -305,18 +295,18 @@ def _lenses(capture: Capture, found: agree.Agreement) -> Iterator[Fault]:
     if bodies is not None and people is not None and len(people.frame):
         rows = agree.partners(bodies.frame, bodies.person, people)
         seen, masks = found.boxes[rows >= 0], mask_boxes(people.masks)[rows[rows >= 0]]
-    for file, what, some, others in (
+    for file, what, boxes, others in (
         ("camera.json", "all", torch.cat([ours, seen]), torch.cat([theirs, masks])),
         ("camera.json", "the scene", ours, theirs),
         ("bodies.npz", "the bodies", seen, masks),
     ):
-        scale, move, shared = _fitted(some, others, camera, camera.K[:2, 2])
+        scale, move, shared = _fitted(boxes, others, camera, camera.K[:2, 2])
         if shared < FITS:
             continue
         K = camera.K * torch.tensor([[scale], [scale], [1.0]])
         K[:2, 2] = camera.K[:2, 2] + move
         mend = partial(mends.seen_by, replace(camera, K=K))
-        if some is seen:
+        if boxes is seen:
             mend = partial(mends.people, torch.linalg.inv(camera.K) @ K)
         lens = f"fl_x {float(K[0, 0]):.4g}, cx {float(K[0, 2]):.4g}, cy {float(K[1, 2]):.4g}"
         name = f"{file}: another lens or crop of the picture fits {what} better, about {lens}"

@@ -75,9 +75,11 @@ def _files(folder: Path, needed: Callable[[Path], At | None]) -> Parts:
     """The files of a folder as they are; `needed` reads those that a capture cannot lack."""
 
     def load_depth(camera: Camera) -> DepthImage | None:
-        found = images.find_depth_file(folder)
+        if (found := images.find_depth_file(folder)) is None:
+            return None
+        path, metric = found
         frame = images.reference_frame(folder)
-        return found and images.read_depth_image(found[0], camera, metric=found[1], frame=frame)
+        return DepthImage(images.read_depth(path, camera, metric=metric, frame=frame), metric)
 
     frames = folder / "frames"
     files = frames.iterdir() if frames.is_dir() else ()
@@ -164,13 +166,10 @@ def write_trees(
         image: The name of the reference image in the folder.
         info: Further fields of `info` in people.json; None: written only with people.
     """
-    camera = camera_to_json(capture.scene.camera)
-    if capture.camera_height is not None:
-        camera["height"] = capture.camera_height
-    if capture.focal_spread is not None:
-        camera["focal_spread"] = capture.focal_spread
-    if capture.focal_by_lines:
-        camera["focal_by_lines"] = True
+    camera = camera_to_json(
+        capture.scene.camera, height=capture.camera_height, focal_spread=capture.focal_spread,
+        focal_by_lines=capture.focal_by_lines,
+    )  # fmt: skip
     write_scene(capture.scene, folder / "scene.json")
     objects = detections_to_json(capture.detections, capture.scene.camera, image)
     write_json(objects, folder / "objects.json")

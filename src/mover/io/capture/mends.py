@@ -11,11 +11,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mover.core.types import Camera, Capture, Detection, Masks, SceneObject, Segment
+from mover.core.types import Camera, Capture, Detection, Masks, SceneObject
 from mover.geometry.camera import pitch_roll, tilted
 from mover.geometry.rle import area, mask_boxes, run_lengths
 from mover.io.capture.agreement import assigned, box_around, in_image, pairwise_iou2d
-from mover.io.capture.tracks import pair_tracks, paired
+from mover.io.capture.scene_file import everywhere
+from mover.io.capture.tracks import pair_tracks
 
 LEAST = 0.2  # overlap of a body and the mask that it lies on
 Mend = Callable[[Capture], Capture]
@@ -38,12 +39,9 @@ def each(change: Change, capture: Capture) -> Capture:
 
 def placed(A: Matrix, sign: float, one: SceneObject) -> SceneObject:
     """The upright object at its position in another world."""
-
-    def carried(place: SceneObject | Segment) -> dict[str, Tensor]:
-        return {"t_world_object": A @ place.t_world_object, "yaw": sign * place.yaw}
-
-    segments = tuple(replace(part, **carried(part)) for part in one.segments)
-    return replace(one, **carried(one), segments=segments)
+    return everywhere(
+        one, lambda at: {"t_world_object": A @ at.t_world_object, "yaw": sign * at.yaw}
+    )
 
 
 def baked(verts: Float[Tensor, "verts 3"], one: SceneObject) -> SceneObject:
@@ -73,8 +71,7 @@ def scaled(size: float, away: float) -> Change:
 
 def in_radians(one: SceneObject) -> SceneObject:
     """The object whose yaw was in degrees."""
-    parts = tuple(replace(part, yaw=part.yaw.deg2rad()) for part in one.segments)
-    return replace(one, yaw=one.yaw.deg2rad(), segments=parts)
+    return everywhere(one, lambda at: {"yaw": at.yaw.deg2rad()})
 
 
 def seen_by(camera: Camera, capture: Capture) -> Capture:
@@ -153,9 +150,8 @@ def same_tracks(capture: Capture) -> Capture:
     bodies, seen = capture.bodies, capture.people
     if bodies is None or seen is None:
         return capture
-    pairs = pair_tracks(bodies, seen, capture.scene.camera)
-    bodies, seen = paired(bodies, seen, pairs)
-    return replace(capture, bodies=bodies, people=seen) if pairs.notes else capture
+    bodies, seen, notes = pair_tracks(bodies, seen, capture.scene.camera)
+    return replace(capture, bodies=bodies, people=seen) if notes else capture
 
 
 def by_masks(capture: Capture) -> Capture:

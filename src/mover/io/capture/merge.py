@@ -14,7 +14,7 @@ import torch
 
 from mover.core.errors import InputError
 from mover.core.records import fingerprint, rows_of
-from mover.core.types import Bodies, Camera, Capture, Scene
+from mover.core.types import Bodies, Camera, Capture, Masks, Scene
 from mover.furniture.library import canonical
 from mover.io.capture import agreement as agree
 from mover.io.capture.annotations_file import detections_of, people_of
@@ -263,15 +263,17 @@ def _check_apart(whole: Parts) -> Iterator[str]:
     camera = _camera_of(whole)
     if camera is None and (whole.people is not None or whole.scene is not None):
         raise InputError(f"{whole.name}: has no camera, expected --camera FILE or --fov DEGREES")
+    masks: list[tuple[str, list[Masks]]] = []
     if camera is not None and whole.objects is not None:
         found = detections_of(whole.objects, camera, ignored.append)
-        inside = agree.bounded([one.mask for one in found if one.mask is not None])
-        if len(inside) and inside.mean() < MOST:
-            yield f"{whole.objects.file}: most masks fill the picture to its borders; inverted?"
+        seen = [one.mask for one in found if one.mask is not None]
+        masks.append((whole.objects.file, seen))
     if camera is not None and whole.people is not None:
         people = people_of(whole.people, camera, ignored.append).people
-        if people is not None and len(people.frame) and agree.bounded([people.masks]).mean() < MOST:
-            yield f"{whole.people.file}: most masks fill the picture to its borders; inverted?"
+        masks.append((whole.people.file, [] if people is None else [people.masks]))
+    for file, every in masks:
+        if every and agree.bounded(every).mean() < MOST:
+            yield f"{file}: most masks fill the picture to its borders; inverted?"
 
 
 def _camera_of(whole: Parts) -> Camera | None:

@@ -39,11 +39,7 @@ SCENE = "scene.json"
 
 
 def check_plausible(capture: Capture, warn: Warn) -> None:
-    """Look at everything that a capture says.
-
-    Raises:
-        InputError: If something cannot be: file, field, found, expected.
-    """
+    """Look at everything that a capture says."""
     known = {d.id: d for d in capture.detections}
     camera = capture.scene.camera
     _check_lens(camera, warn)

@@ -3,15 +3,16 @@
 import json
 import logging
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 import torch
 from msgspec import Meta, Struct
+from torch import Tensor
 
 from mover.core.types import Camera, Scene, SceneObject, Segment
 from mover.geometry.rotations import rot_y, wrap
@@ -28,7 +29,7 @@ SAFE_ID = re.compile(r"\w[\w.-]*")
 LONGEST_ID = 60  # [bytes]
 WORDS = ("ground", "free")
 LOWEST = 30.0  # [m], of a floor below the camera
-P = TypeVar("P", SceneObject, Segment)
+Placed = SceneObject | Segment
 
 
 def read_scene(path: Path, camera: Camera | None = None) -> Scene:
@@ -163,11 +164,17 @@ def _turn(one: SceneObject, angle: float) -> SceneObject:
     """The object in the world turned about +y [rad]."""
     turn = torch.tensor(angle, dtype=torch.float64)
 
-    def turned_by(place: P) -> P:
+    def turned_by(place: Placed) -> dict[str, Tensor]:
         t = (rot_y(turn) @ place.t_world_object.double()).to(place.t_world_object)
-        return replace(place, t_world_object=t, yaw=wrap(place.yaw.double() + turn).to(place.yaw))
+        return {"t_world_object": t, "yaw": wrap(place.yaw.double() + turn).to(place.yaw)}
 
-    return replace(turned_by(one), segments=tuple(turned_by(part) for part in one.segments))
+    return everywhere(one, turned_by)
+
+
+def everywhere(one: SceneObject, change: Callable[[Placed], dict[str, Tensor]]) -> SceneObject:
+    """The object with new fields, and so each of its segments."""
+    segments = tuple(replace(part, **change(part)) for part in one.segments)
+    return replace(one, **change(one), segments=segments)
 
 
 def scene_tree(objects: Sequence[Mapping[str, Any]], file: str, ground: float | None = None) -> At:
@@ -216,7 +223,7 @@ def write_scene(
     write_json({**head, **spread, **below, "objects": objects}, path)
 
 
-def _placed(one: SceneObject | Segment) -> dict[str, Any]:
+def _placed(one: Placed) -> dict[str, Any]:
     return {"translation": plain(one.t_world_object), "yaw": plain(one.yaw)}
 
 

@@ -33,17 +33,10 @@ Track = tuple[str, int]
 """`bodies` or `masks`, and its number."""
 
 
-@dataclass(frozen=True)
-class TrackPairs:
-    """One number for each person: the new number by the old one, and what changed in words."""
-
-    bodies: Mapping[int, int]
-    masks: Mapping[int, int]
-    notes: tuple[str, ...] = ()
-
-
-def pair_tracks(bodies: Bodies, people: People, camera: Camera) -> TrackPairs:
-    """Pair tracks of bodies and of masks by their positions in the image.
+def pair_tracks(
+    bodies: Bodies, people: People, camera: Camera
+) -> tuple[Bodies, People, tuple[str, ...]]:
+    """One number for each person: tracks of bodies and of masks paired by their positions.
 
     A body and a mask are paired where their boxes overlap in the frames that they share, and no
     other mask or body of these frames fits nearly as well. A person in pieces, on either side,
@@ -55,7 +48,8 @@ def pair_tracks(bodies: Bodies, people: People, camera: Camera) -> TrackPairs:
         camera: Whose lens sees both.
 
     Returns:
-        The numbers of the bodies count; those of a mask without a body may change to a free one.
+        Both under their new numbers, and what changed in words. The numbers of the bodies count;
+        those of a mask without a body may change to a free one. Heights count masks, then bodies.
     """
     verts = bodies.verts[:, :: max(1, bodies.verts.shape[1] // POINTS)]
     seen = (verts[..., 2] > NEAR).all(1, keepdim=True)  # without area: beside or behind the camera
@@ -84,8 +78,10 @@ def pair_tracks(bodies: Bodies, people: People, camera: Camera) -> TrackPairs:
     return _numbered(groups, bodies, people)
 
 
-def _numbered(groups: Mapping[Track, set[Track]], bodies: Bodies, people: People) -> TrackPairs:
-    """Numbers of the groups in which no person is twice in a frame."""
+def _numbered(
+    groups: Mapping[Track, set[Track]], bodies: Bodies, people: People
+) -> tuple[Bodies, People, tuple[str, ...]]:
+    """One number for each of the groups in which no person is twice in a frame."""
     sides: Mapping[str, Bodies | People] = {"bodies": bodies, "masks": people}
     found: dict[str, dict[int, int]] = {"bodies": {}, "masks": {}}
     for group in {id(group): group for group in groups.values()}.values():
@@ -105,17 +101,12 @@ def _numbered(groups: Mapping[Track, set[Track]], bodies: Bodies, people: People
         if found[name]:
             same = ", ".join(f"track {old} is {new}" for old, new in found[name].items())
             notes.append(f"{file}: by its position in the image {same}")
-    return TrackPairs(found["bodies"], found["masks"], tuple(notes))
-
-
-def paired(bodies: Bodies, people: People, pairs: TrackPairs) -> tuple[Bodies, People]:
-    """Bodies and masks under the numbers of `pair_tracks`; heights count masks, then bodies."""
-    masks = {one: pairs.masks.get(one, one) for one in people.person.tolist()}
-    numbers = {**pairs.bodies, **pairs.masks, **masks}
+    numbers = {**found["bodies"], **{mask: mask for mask in masks}, **found["masks"]}
     heights = {str(numbers.get(int(k), int(k))): v for k, v in people.heights.items()}
-    return replace(bodies, person=renumbered(bodies.person, pairs.bodies)), replace(
-        people, person=renumbered(people.person, pairs.masks), heights=heights
-    )
+    person = renumbered(people.person, found["masks"])
+    people = replace(people, person=person, heights=heights)
+    bodies = replace(bodies, person=renumbered(bodies.person, found["bodies"]))
+    return bodies, people, tuple(notes)
 
 
 def renumbered(person: Int[Tensor, " rows"], numbers: Mapping[int, int]) -> Int[Tensor, " rows"]:

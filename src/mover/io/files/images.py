@@ -54,11 +54,7 @@ def opened(
 
 
 def read_image(at: At, folder: Path, camera: Camera) -> Float[Tensor, "h w 3"]:
-    """The picture that a field names, upright, in [0, 1]; its size must be the camera's.
-
-    Raises:
-        InputError: If it is missing, cannot be read or has another size.
-    """
+    """The picture that a field names, upright, in [0, 1]; its size must be the camera's."""
     return read_image_file(at, inside(at, folder), camera)
 
 
@@ -139,11 +135,6 @@ def reference_frame(folder: Path) -> int:
     given = at.maybe("reference") or at.maybe("frame")
     value = np.zeros(1) if given is None else np.asarray(given.value).reshape(-1)
     return int(value[0]) if value.size and value.dtype.kind in "iu" else 0
-
-
-def read_depth_image(path: Path, camera: Camera, *, metric: bool, frame: int = 0) -> DepthImage:
-    """The measured depth of the reference picture."""
-    return DepthImage(read_depth(path, camera, metric=metric, frame=frame), metric)
 
 
 def write_depth_image(depth: DepthImage, folder: Path) -> None:
@@ -233,13 +224,9 @@ def _of_png(path: Path, metric: bool) -> NDArray[np.float64]:
     kind = "a depth map" if metric else "a map of inverse depth"
     with opened(path, expected=kind, bombs="error") as picture:
         mode, values = picture.mode, np.asarray(picture, dtype=np.float64)
+    expected = "" if values.ndim == 2 else "one grey value, larger where nearer"
     if metric and not mode.startswith("I"):
-        raise InputError(
-            f"{path.name}: has {mode} pixels, expected 16 bits of millimetres (8 bits or colours "
-            "have no unit)"
-        )
-    if values.ndim != 2:
-        raise InputError(
-            f"{path.name}: has {mode} pixels, expected one grey value, larger where nearer"
-        )
+        expected = "16 bits of millimetres (8 bits or colours have no unit)"
+    if expected:
+        raise InputError(f"{path.name}: has {mode} pixels, expected {expected}")
     return values / MILLIMETRES if metric else values

@@ -36,11 +36,7 @@ def is_amass(at: At) -> bool:
 
 
 def read_npz(path: Path) -> At:
-    """The arrays of an .npz file by name; one of objects or fields is `NotPlain`.
-
-    Raises:
-        InputError: If it is missing, broken or too large.
-    """
+    """The arrays of an .npz file by name; one of objects or fields is `NotPlain`."""
     name = existing(path, "an .npz file").name or path.resolve().name
     try:
         odd = _odd_arrays(path)
