@@ -357,8 +357,7 @@ def _facts(objects: Objects, image: ImageCues, humans: HumanCues, weights: Scene
     facts[:, 1] = share * human_terms.SAMPLES / max(1, objects.samples.shape[1])
     if image.distance is not None:
         facts[:, 2] = image.distance.clamp_min(1e-3).log()
-    touches: human_terms.ContactPoints | None = humans.touches
-    if touches is not None:
+    if (touches := humans.touches) is not None:
         facts[touches.object_of, 3:5] = touches.heading
         facts[touches.object_of, 5] = (touches.heading.square().sum(-1) > 0).to(facts)
     return facts
