@@ -127,11 +127,7 @@ def keypoints_of(
 
 @lru_cache(maxsize=16)
 def spots_of(model: BodyModel, layout: str) -> Spots:
-    """Where the keypoints of a layout are on this model.
-
-    Raises:
-        ValueError: If there is no such layout.
-    """
+    """Where the keypoints of a layout are on this model; see `keypoints_of`."""
     if layout not in LAYOUTS:
         raise ValueError(f"no layout '{layout}', known are {', '.join(LAYOUTS)}")
     names = LAYOUTS[layout]

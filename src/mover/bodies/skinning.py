@@ -92,7 +92,8 @@ class SkinnedBody:
         unless `pose.extra["flat_hand_mean"]` says that the hands are turned from flat ones.
 
         Raises:
-            InputError: If the numbers of coefficients or angles are not this model's.
+            InputError: If the numbers of coefficients or angles are not this model's (here, and in
+                all functions below that look at these).
         """
         turns = axis_angle(angles_of(self, with_full_hands(self, pose)))
         verts, joints = self.rest(turns, pose.betas, pose.extra.get("expression"))
@@ -104,11 +105,7 @@ class SkinnedBody:
         betas: Float[Tensor, "bodies shape"],
         face: Float[Tensor, "bodies expression"] | None,
     ) -> Posed:
-        """Rest shape and joints with the correctives of pose and expression [m].
-
-        Raises:
-            InputError: If there are more coefficients than the model knows.
-        """
+        """Rest shape and joints with the correctives of pose and expression [m]."""
         verts, joints = shaped(self, betas)
         most = 0 if self.expression_dirs is None else self.expression_dirs.shape[-1]
         if face is not None and self.expression_dirs is not None and most:
@@ -160,11 +157,7 @@ def growth_of(model: SkinnedBody) -> Float[Tensor, " shape"]:
 
 
 def with_full_hands(model: SkinnedBody, pose: BodyPose) -> BodyPose:
-    """The same pose with hands as 45 angles each, the mean hand added; SMPL's palms stay straight.
-
-    Raises:
-        InputError: If there are more components than the model has.
-    """
+    """The pose with hands as 45 angles each, the mean hand added; SMPL's palms stay straight."""
     body = pose.body_pose
     if model.name == "smpl" and body.shape[-1] == 63:
         body = torch.cat([body, body.new_zeros(len(body), 6)], -1)
@@ -227,11 +220,7 @@ def widths_of(model: SkinnedBody) -> dict[str, int]:
 
 
 def angles_of(model: SkinnedBody, pose: BodyPose) -> Float[Tensor, "bodies joints 3"]:
-    """Axis-angle vectors of all joints; parts that are not given stay straight.
-
-    Raises:
-        InputError: If a part has another number of angles.
-    """
+    """Axis-angle vectors of all joints; parts that are not given stay straight."""
     bodies = pose.global_orient.shape[0]
     given = {**pose.extra, "global_orient": pose.global_orient, "body_pose": pose.body_pose}
     rows: list[Tensor] = []
@@ -247,11 +236,7 @@ def angles_of(model: SkinnedBody, pose: BodyPose) -> Float[Tensor, "bodies joint
 
 
 def shaped(model: SkinnedBody, betas: Float[Tensor, "bodies shape"]) -> Posed:
-    """Rest shape and joints of each person [m]; shape coefficients that are not given are 0.
-
-    Raises:
-        InputError: If there are more than the model knows.
-    """
+    """Rest shape and joints of each person [m]; shape coefficients that are not given are 0."""
     count, most = betas.shape[-1], model.shape_dirs.shape[-1]
     if count > most and (betas[..., most:] != 0).any():
         raise InputError(

@@ -49,11 +49,7 @@ def keys_of(name: str) -> tuple[str, ...]:
 
 
 def body_from(arrays: Mapping[str, Any], name: str, gender: str, file: str) -> SkinnedBody:
-    """The body model in the arrays of a file.
-
-    Raises:
-        InputError: If an array is missing or does not have the model's shape.
-    """
+    """The body model in the arrays of a file, which are checked first."""
     kind = KINDS[name]
     _check_model(arrays, name, file)
     verts, joints = kind.verts, len(kind.joints)
@@ -104,11 +100,7 @@ def _check_model(arrays: Mapping[str, Any], name: str, file: str) -> None:
 def _numbers(
     arrays: Mapping[str, Any], key: str, shape: tuple[int | None, ...], file: str
 ) -> NDArray[np.float64]:
-    """An array of finite numbers of this shape; None stands for any size.
-
-    Raises:
-        InputError: If it is anything else.
-    """
+    """An array, if it is one of finite numbers of this shape; None stands for any size."""
     value = arrays[key]
     if hasattr(value, "toarray") and _fits(value.shape, shape):  # else it may be huge
         value = value.toarray()
@@ -213,11 +205,7 @@ def load_smpl(name: str, gender: str = "neutral", place: Path | None = None) -> 
 
 
 def find_file(name: str, gender: str, place: Path | None = None) -> Path:
-    """The user's file of a model.
-
-    Raises:
-        InputError: If there is none; the message names where it was looked for.
-    """
+    """The user's file of a model; an error names where it was looked for."""
     if place is None:
         given = os.environ.get(FOLDER)
         if not given:

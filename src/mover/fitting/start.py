@@ -247,9 +247,8 @@ def _tried(guess: Guess, seen: Seen, R: Float[Tensor, "3 3"], rig: Rig, config: 
         return dataclasses.replace(state, at=u).energy(START)
 
     at = solve(energy, state.at, config.start_steps, ("turn", "code", "place"))
-    with torch.no_grad():
-        cost = energy(at).per_item / START.pose**2 - narrow
-        joints = points_of(at, frame).joints[:, :22]
+    cost = energy(at).per_item / START.pose**2 - narrow
+    joints = points_of(at, frame).joints[:, :22]
     if not guess.upright:
         slope = (trunk_of(joints) @ seen.up).clamp(-1, 1).asin()
         cost = cost + robust_square(slope.square(), SLOPE) / LEVEL**2
@@ -310,10 +309,7 @@ def start_rows(
 ) -> Int[Tensor, " rows"]:
     """The row of `start` for each row of the keypoints: the same person, the nearest frame.
 
-    People are paired by where they are in the image.
-
-    Raises:
-        InputError: If a person of the keypoints has no body.
+    People are paired by where they are in the image; each has to have a body.
     """
     from scipy.optimize import linear_sum_assignment
 
