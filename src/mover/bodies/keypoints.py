@@ -98,8 +98,7 @@ class Spots:
     share: Float[Tensor, "keypoints 3"]
     joint: Int[Tensor, " keypoints"]
     """The joint that a keypoint is; -1: it is a mixture of vertices."""
-    there: Bool[Tensor, " keypoints"]
-    """Keypoints that the model has."""
+    there: Bool[Tensor, " keypoints"]  #: keypoints that the model has
 
 
 def keypoints_of(

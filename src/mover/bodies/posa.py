@@ -138,15 +138,11 @@ def _sparse(path: Path, shape: tuple[int, int]) -> Tensor:
 class Posa:
     """A decoder and the meshes that it works on."""
 
-    weights: dict[str, Tensor]
-    """Of the decoder."""
+    weights: dict[str, Tensor]  #: of the decoder
     spirals: Int[Tensor, "coarse 9"]
-    down: tuple[Tensor, ...]
-    """Sparse matrices from the full body to coarser meshes, in order."""
-    up: tuple[Tensor, ...]
-    """Sparse matrices back, in order."""
-    channels: int
-    """1: contact; 43: contact and the kind of object."""
+    down: tuple[Tensor, ...]  #: sparse matrices from the full body to coarser meshes, in order
+    up: tuple[Tensor, ...]  #: sparse matrices back, in order
+    channels: int  #: 1: contact; 43: contact and the kind of object
 
 
 def load_posa(weights: Path, meshes: Path) -> Posa:

@@ -39,8 +39,7 @@ Turns = Float[Tensor, "bodies joints 3 3"]
 class Hands:
     """The space of hand poses; the first axis is left, right."""
 
-    mean: Float[Tensor, "2 45"]
-    """Axis-angle vectors of a relaxed hand [rad]."""
+    mean: Float[Tensor, "2 45"]  #: axis-angle vectors of a relaxed hand [rad]
     components: Float[Tensor, "2 components 45"]
     """Principal components of hand poses, one a row [rad]."""
 
@@ -62,16 +61,13 @@ class SkinnedBody:
     joint_names: tuple[str, ...]
     parents: tuple[int, ...]
     """Index of each joint's parent, always an earlier one; -1 for the root."""
-    verts: Float[Tensor, "verts 3"]
-    """The rest shape [m]."""
-    joints: Float[Tensor, "joints 3"]
-    """Places of the joints in the rest shape [m]."""
+    verts: Float[Tensor, "verts 3"]  #: the rest shape [m]
+    joints: Float[Tensor, "joints 3"]  #: places of the joints in the rest shape [m]
     weights: Float[Tensor, "verts joints"]
     """Share of each joint in the motion of a vertex; rows sum to 1."""
     shape_dirs: Float[Tensor, "verts 3 shape"]
     """Displacement of the rest shape for one unit of each shape coefficient [m]."""
-    joint_dirs: Float[Tensor, "joints 3 shape"]
-    """The same for the joints [m]."""
+    joint_dirs: Float[Tensor, "joints 3 shape"]  #: the same for the joints [m]
     tpose: Float[Tensor, "joints 3 3"]
     """Turns the parts of the rest shape, bone by bone, into the zero pose."""
 

@@ -31,11 +31,9 @@ class FitInputs:
     """What bodies are fitted to, and with what."""
 
     keypoints: Keypoints
-    camera: Camera
-    """The true lens; its rotation is the first guess of upright."""
+    camera: Camera  #: the true lens; its rotation is the first guess of upright
     model: SkinnedBody
-    start: Bodies | None = None
-    """Bodies of another tool in the camera frame, with parameters."""
+    start: Bodies | None = None  #: bodies of another tool in the camera frame, with parameters
     prior: unknowns.PosePrior = unknowns.ANGLES
     ground: float | None = None
     """Height of the floor in the camera's world [m], where it is known: no person goes below it."""
@@ -48,10 +46,8 @@ class Fitted:
     """Bodies in the camera frame, and how well they explain the keypoints."""
 
     bodies: Bodies
-    rows: Int[Tensor, " bodies"]
-    """The row of the keypoints of each body."""
-    miss: Float[Tensor, " bodies"]
-    """Root mean square distance of the keypoints that are seen [px]."""
+    rows: Int[Tensor, " bodies"]  #: the row of the keypoints of each body
+    miss: Float[Tensor, " bodies"]  #: root mean square distance of the keypoints that are seen [px]
     warnings: tuple[str, ...]
 
 

@@ -75,24 +75,18 @@ class FitStart:
 
     at: Unknowns
     root: Float[Tensor, "bodies 3 3"]
-    centre: Float[Tensor, "bodies 63"]
-    """The pose that is expected [rad]."""
-    spread: Float[Tensor, "bodies 63"]
-    """How far from it each angle may be [rad]."""
+    centre: Float[Tensor, "bodies 63"]  #: the pose that is expected [rad]
+    spread: Float[Tensor, "bodies 63"]  #: how far from it each angle may be [rad]
 
 
 @record
 class Guess:
     """A hypothesis that is tried for every row."""
 
-    pose: Float[Tensor, "63"]
-    """Angles of the body [rad]."""
-    spread: Float[Tensor, "63"]
-    """How far from them each may be [rad]."""
-    root: Float[Tensor, "3 3"]
-    """The root's rotation in the world."""
-    upright: bool
-    """Tilted in the image as the trunk is seen there."""
+    pose: Float[Tensor, "63"]  #: angles of the body [rad]
+    spread: Float[Tensor, "63"]  #: how far from them each may be [rad]
+    root: Float[Tensor, "3 3"]  #: the root's rotation in the world
+    upright: bool  #: tilted in the image as the trunk is seen there
 
 
 @record
@@ -100,8 +94,7 @@ class Tried(FitStart):
     """A hypothesis that was fitted to rows."""
 
     cost: Float[Tensor, " bodies"]
-    joints: Float[Tensor, "bodies joints 3"]
-    """Of the body, in camera axes [m]."""
+    joints: Float[Tensor, "bodies joints 3"]  #: of the body, in camera axes [m]
 
 
 def upright_guesses(like: Tensor) -> list[Guess]:

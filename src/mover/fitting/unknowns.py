@@ -33,8 +33,7 @@ class Rig:
     """Share of each joint, then of each vertex, in each keypoint."""
     keypoints: Int[Tensor, " keypoints"]
     """Index of the keypoints in their layout: those that are used and that the model has."""
-    names: tuple[str, ...]
-    """Of these keypoints."""
+    names: tuple[str, ...]  #: of these keypoints
     bones: Int[Tensor, " keypoints"]
     """The joint whose rotation carries each keypoint: of a joint, its parent."""
 
@@ -84,8 +83,7 @@ NO_OFFSETS = torch.zeros(0, 0, 3)
 class Unknowns:
     """One row a body, one shape a person."""
 
-    turn: Float[Tensor, "bodies 3"]
-    """Turns the root's first guess, in camera axes [rad]."""
+    turn: Float[Tensor, "bodies 3"]  #: turns the root's first guess, in camera axes [rad]
     code: Float[Tensor, "bodies code"]
     """The pose of the body: its angles [rad], or the code of a learned prior."""
     place: Float[Tensor, "bodies 3"]
@@ -130,10 +128,8 @@ class Frame:
     """What turns unknowns into a body, and is not solved."""
 
     rig: Rig
-    root: Float[Tensor, "bodies 3 3"]
-    """First guess of the root's rotation, in camera axes."""
-    person: Int[Tensor, " bodies"]
-    """Row of `betas`."""
+    root: Float[Tensor, "bodies 3 3"]  #: first guess of the root's rotation, in camera axes
+    person: Int[Tensor, " bodies"]  #: row of `betas`
     growth: Float[Tensor, " shape"] | None = None
     """What each number of the shape adds to the logarithm of the depth: a taller person farther
     away looks the same, so that shapes alone would hardly move. None: nothing."""
