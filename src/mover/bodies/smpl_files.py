@@ -60,6 +60,17 @@ def body_from(arrays: Mapping[str, Any], name: str, gender: str, file: str) -> S
     weights = _numbers(arrays, "weights", (verts, joints), file)
     shape, expression = _split(dirs, name, file)
     faces = _indices(arrays, "f", (None, 3), verts, file)
+    hands = face = None
+    if kind.hands:
+        components = [_numbers(arrays, key, (None, 45), file) for key in HAND_KEYS[:2]]
+        mean = [_numbers(arrays, key, (45,), file) for key in HAND_KEYS[2:]]
+        if len(components[0]) != len(components[1]):
+            raise InputError(f"{file}: fields 'hands_componentsl' and 'hands_componentsr' differ")
+        hands = Hands(_tensor(np.stack(mean)), _tensor(np.stack(components)))
+    if all(key in arrays for key in FACE_KEYS):
+        index = _indices(arrays, "lmk_faces_idx", (51,), len(faces), file)
+        share = _numbers(arrays, "lmk_bary_coords", (51, 3), file)
+        face = FacePoints(torch.from_numpy(faces[index]), _tensor(share))
     at_joints = (regressor @ dirs.reshape(verts, -1)).reshape(joints, 3, -1)
     return SkinnedBody(
         name=name, faces=torch.from_numpy(faces), joint_names=kind.joints,
@@ -69,8 +80,7 @@ def body_from(arrays: Mapping[str, Any], name: str, gender: str, file: str) -> S
         tpose=torch.eye(3).expand(joints, 3, 3).clone(),
         pose_dirs=_tensor(poses.transpose(2, 0, 1)), expression_dirs=_tensor(dirs[..., expression]),
         expression_joint_dirs=_tensor(at_joints[..., expression]),
-        hands=_hands(arrays, file) if kind.hands else None, face=_face(arrays, faces, file),
-        gender=gender,
+        hands=hands, face=face, gender=gender,
     )  # fmt: skip
 
 
@@ -156,23 +166,6 @@ def _split(dirs: NDArray[np.float64], name: str, file: str) -> tuple[slice, slic
     if count < SHAPE_1_1 + 100:
         return slice(0, CORE), slice(CORE, 2 * CORE)
     return slice(0, SHAPE_1_1), slice(SHAPE_1_1, count)
-
-
-def _hands(arrays: Mapping[str, Any], file: str) -> Hands:
-    components = [_numbers(arrays, key, (None, 45), file) for key in HAND_KEYS[:2]]
-    mean = [_numbers(arrays, key, (45,), file) for key in HAND_KEYS[2:]]
-    if len(components[0]) != len(components[1]):
-        raise InputError(f"{file}: fields 'hands_componentsl' and 'hands_componentsr' differ")
-    return Hands(_tensor(np.stack(mean)), _tensor(np.stack(components)))
-
-
-def _face(arrays: Mapping[str, Any], faces: NDArray[np.int64], file: str) -> FacePoints | None:
-    """Points of the face where the file has them."""
-    if any(key not in arrays for key in FACE_KEYS):
-        return None
-    index = _indices(arrays, "lmk_faces_idx", (51,), len(faces), file)
-    share = _numbers(arrays, "lmk_bary_coords", (51, 3), file)
-    return FacePoints(torch.from_numpy(faces[index]), _tensor(share))
 
 
 FOLDER = "MOVER_BODY_MODELS"
