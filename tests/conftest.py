@@ -90,6 +90,15 @@ def quick(monkeypatch):
 
 
 @pytest.fixture(scope="session")
+def smpl_models(tmp_path_factory):
+    """A folder with synthetic files of SMPL, SMPL-H and SMPL-X."""
+    from make_smpl import write_models
+
+    names = ("smpl", "smplh", "smplx")
+    return write_models(tmp_path_factory.mktemp("models"), names)
+
+
+@pytest.fixture(scope="session")
 def demo_room():
     """The room of `mover demo`."""
     from kept_rooms import demo, kept

@@ -79,6 +79,26 @@ def rest_pose(bodies: int, model: SkinnedBody) -> BodyPose:
     return replace(zero, gender=model.gender, betas=zero.betas[:, :10].clone())
 
 
+def random_pose(model, bodies=2, seed=0, size=0.4):
+    """People in random poses, shapes and places, with all angles that the model has."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def some(*shape, size=size):
+        return size * torch.randn(*shape, generator=generator)
+
+    zero = rest_pose(bodies, model)
+    extra = {}
+    if model.name != "smpl":
+        extra = {f"{side}_hand_pose": some(bodies, 45) for side in ("left", "right")}
+    if model.name == "smplx":
+        extra |= {name: some(bodies, 3) for name in ("jaw_pose", "leye_pose", "reye_pose")}
+        extra["expression"] = some(bodies, 10, size=1.0)
+    return replace(
+        zero, betas=some(*zero.betas.shape, size=1.0), global_orient=some(bodies, 3, size=1.0),
+        body_pose=some(*zero.body_pose.shape), transl=some(bodies, 3, size=1.0), extra=extra,
+    )  # fmt: skip
+
+
 def keypoints_at(frame, fps, points=None):
     """Keypoints of one person at some moments."""
     count = len(frame)

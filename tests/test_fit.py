@@ -8,11 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from make_keypoints import CAMERA, as_bodies, keypoints_at, leg_columns, seen, walker
+from make_keypoints import (
+    CAMERA,
+    as_bodies,
+    keypoints_at,
+    leg_columns,
+    random_pose,
+    seen,
+    walker,
+)
 from make_smpl import make_model, write_npz
 
 from mover.bodies.keypoints import LAYOUTS, keypoints_of
-from mover.bodies.skinning import heights_of, open_body, shaped, zero_pose
+from mover.bodies.skinning import heights_of, open_body, shaped
 from mover.bodies.smpl_files import load_smpl
 from mover.core.errors import InputError
 from mover.core.types import Scene
@@ -24,7 +32,7 @@ from mover.fitting.energy import FitState
 from mover.fitting.ground import balance_cost, center_of_mass, standing_share
 from mover.fitting.start import placed
 from mover.fitting.tracks import best_path, motion_of, seen_of
-from mover.fitting.unknowns import Frame, Unknowns, move, points_of, rig_of
+from mover.fitting.unknowns import Frame, Unknowns, place_of, points_of, rig_of
 from mover.geometry.camera import project
 from mover.geometry.rotations import axis_angle, rot_x
 from mover.io.capture.scene_file import write_scene
@@ -128,46 +136,27 @@ def test_offsets_cost_their_squared_deviations_by_the_name_of_the_keypoint():
     assert float(deviation_term(every, lasting.repeat_interleave(3))) == pytest.approx(9)
 
 
-def random_pose(rows=3, seed=0):
-    rng = torch.Generator().manual_seed(seed)
-    sizes = {"betas": 10, "global_orient": 3, "body_pose": 63, "transl": 3}
-    some = {name: torch.randn(rows, size, generator=rng) for name, size in sizes.items()}
-    some["body_pose"] *= 0.5
-    return dataclasses.replace(zero_pose(rows, open_body()), **some)
-
-
-def test_the_rig_puts_keypoints_and_joints_where_the_whole_body_has_them():
-    pose = random_pose()
-    verts, joints = open_body().posed(pose)
-    wanted = keypoints_of(open_body(), verts, joints, "openpose25")
-    rig = rig_of(open_body(), "openpose25", torch.ones(25, dtype=torch.bool))
-    root = axis_angle(pose.global_orient)[:, None]
-    turns = torch.cat([root, axis_angle(pose.body_pose.reshape(-1, 21, 3))], 1)
-    points = move(rig, turns, pose.betas, joints[:, 0])
-    torch.testing.assert_close(points.keypoints, wanted, atol=2e-5, rtol=0)
-    torch.testing.assert_close(points.joints, joints[:, :22], atol=2e-5, rtol=0)
-
-
-@pytest.mark.slow
-def test_the_rig_of_smplx_has_its_hands_face_correctives_and_expression(tmp_path):
-    file = write_npz(make_model("smplx"), tmp_path / "smplx" / "SMPLX_NEUTRAL.npz")
-    model = load_smpl("smplx", place=file)
-    rng = torch.Generator().manual_seed(1)
-    expression = torch.randn(2, 10, generator=rng)
-    base = random_pose(2)
-    pose = dataclasses.replace(base, model="smplx", extra={"expression": expression})
+@pytest.mark.parametrize("name", ["makehuman", pytest.param("smplx", marks=pytest.mark.slow)])
+def test_the_rig_puts_keypoints_and_joints_where_the_whole_body_has_them(name, tmp_path):
+    """Of SMPL-X with its hands, face, correctives and expression."""
+    model, layout, count = open_body(), "openpose25", 22
+    if name == "smplx":
+        file = write_npz(make_model(name), tmp_path / "SMPLX_NEUTRAL.npz")
+        model, layout, count = load_smpl(name, place=file), "smplifyx118", 55
+    some = random_pose(model, 3, size=0.5)
+    extra = {key: value for key, value in some.extra.items() if key == "expression"}
+    away = some.transl + torch.tensor([0.0, 0.0, 6.0])
+    pose, none = dataclasses.replace(some, transl=away, extra=extra), torch.zeros(3, 0)
     verts, joints = model.posed(pose)
-    wanted = keypoints_of(model, verts, joints, "smplifyx118")
-    rig = rig_of(model, "smplifyx118", torch.ones(118, dtype=torch.bool))
-    none = torch.zeros(2, 0)
-    at = Unknowns(
-        torch.zeros(2, 3), pose.body_pose, torch.zeros(2, 3), pose.betas, none,
-        torch.cat([torch.zeros(2, 3), expression], -1),
-    )  # fmt: skip
-    frame = Frame(rig, axis_angle(pose.global_orient), torch.arange(2))
-    points = points_of(at, frame)
+    rig = rig_of(model, layout, torch.ones(len(LAYOUTS[layout]), dtype=torch.bool))
+    face = torch.cat([torch.zeros(3, 3), *extra.values()], -1) if extra else none
+    place = place_of(joints[:, 0])
+    at = Unknowns(torch.zeros(3, 3), pose.body_pose, place, pose.betas, none, face)
+    points = points_of(at, Frame(rig, axis_angle(pose.global_orient), torch.arange(3)))
+    torch.testing.assert_close(points.joints, joints[:, :count], atol=2e-5, rtol=0)
     about = points.keypoints - points.joints[:, :1]
-    torch.testing.assert_close(about, wanted - joints[:, :1], atol=1e-5, rtol=0)
+    wanted = keypoints_of(model, verts, joints, layout) - joints[:, :1]
+    torch.testing.assert_close(about, wanted, atol=1e-5, rtol=0)
 
 
 @pytest.mark.slow

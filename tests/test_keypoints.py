@@ -5,7 +5,6 @@ import pytest
 import torch
 from figures import SEATED, pose, turned
 from make_keypoints import rest_pose
-from make_smpl import write_models
 
 from mover.bodies.keypoints import LAYOUTS, keypoints_of, spots_of
 from mover.bodies.skinning import open_body, zero_pose
@@ -13,11 +12,6 @@ from mover.bodies.smpl_files import load_smpl
 from mover.geometry.mesh import vertex_normals
 
 BODIES = ("small", "full")
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return write_models(tmp_path_factory.mktemp("models"))
 
 
 def named(model, layout, base=None):
@@ -148,13 +142,13 @@ ORDER = [
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_all_118_keypoints_of_smplx_equal_those_of_the_smplx_package(folder):
+def test_all_118_keypoints_of_smplx_equal_those_of_the_smplx_package(smpl_models):
     smplx = pytest.importorskip("smplx")
-    model = load_smpl("smplx", place=folder)
+    model = load_smpl("smplx", place=smpl_models)
     generator = torch.Generator().manual_seed(2)
     base = rest_pose(2, model)
     base = replace(base, body_pose=0.4 * torch.randn(2, 63, generator=generator))
-    file = folder / "smplx" / "SMPLX_NEUTRAL.npz"
+    file = smpl_models / "smplx" / "SMPLX_NEUTRAL.npz"
     other = smplx.create(str(file), model_type="smplx", batch_size=2)
     found = other(body_pose=base.body_pose, betas=base.betas)
     points = keypoints_of(model, *model.posed(base), "smplifyx118")
@@ -162,10 +156,10 @@ def test_all_118_keypoints_of_smplx_equal_those_of_the_smplx_package(folder):
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_feet_face_and_tips_of_smplh_equal_those_of_the_smplx_package(folder):
+def test_feet_face_and_tips_of_smplh_equal_those_of_the_smplx_package(smpl_models):
     smplx = pytest.importorskip("smplx")
-    model = load_smpl("smplh", place=folder)
-    file = folder / "smplh" / "SMPLH_NEUTRAL.npz"
+    model = load_smpl("smplh", place=smpl_models)
+    file = smpl_models / "smplh" / "SMPLH_NEUTRAL.npz"
     found = smplx.create(str(file), model_type="smplh", ext="npz")().joints[0, 52:]
     at = named(model, "openpose137")
     names = ["nose", "right_eye", "left_eye", "right_ear", "left_ear"]
@@ -176,8 +170,8 @@ def test_feet_face_and_tips_of_smplh_equal_those_of_the_smplx_package(folder):
     torch.testing.assert_close(points, found, atol=2e-6, rtol=0)
 
 
-def test_points_of_the_synthetic_smplx_are_those_of_the_open_body_but_a_contour(folder):
-    model = load_smpl("smplx", place=folder)
+def test_points_of_the_synthetic_smplx_are_those_of_the_open_body_but_a_contour(smpl_models):
+    model = load_smpl("smplx", place=smpl_models)
     open_ones = named(open_body(), "openpose25")
     shift = torch.tensor([0.02, 0.31, -0.05])
     for name, point in named(model, "openpose25").items():

@@ -28,8 +28,8 @@ def joined(*meshes: Mesh) -> Mesh:
     return Mesh(torch.cat([one.verts for one in meshes]), torch.cat(faces))
 
 
-def sphere(level: int = 3) -> Mesh:
-    return as_mesh(trimesh.creation.icosphere(level))
+def sphere(level: int = 3, radius: float = 1.0) -> Mesh:
+    return as_mesh(trimesh.creation.icosphere(level, radius))
 
 
 def cube(low: tuple[float, float, float] = (0, 0, 0)) -> Mesh:

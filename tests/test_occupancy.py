@@ -11,7 +11,6 @@ from mover.core.errors import InputError
 from mover.core.types import Mesh
 from mover.geometry.mesh import box, signed_volume
 from mover.geometry.occupancy import (
-    ExtractConfig,
     OccupancyNetwork,
     extract,
     load_occupancy,
@@ -21,7 +20,6 @@ from mover.geometry.occupancy import (
 )
 from mover.geometry.topology import is_closed
 
-SMALL = ExtractConfig(coarse=8, levels=2)
 CORNER = Mesh(
     torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]),
     torch.tensor([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]),
@@ -30,31 +28,23 @@ CORNER = Mesh(
 
 def published(hidden: int, code: int, decoder: int) -> dict[str, tuple[int, ...]]:
     """Keys and shapes of the checkpoint, written out from the page of the authors' model."""
-    shapes: dict[str, tuple[int, ...]] = {
-        "encoder.fc_pos.weight": (2 * hidden, 3), "encoder.fc_pos.bias": (2 * hidden,),
-        "encoder.fc_c.weight": (code, hidden), "encoder.fc_c.bias": (code,),
-        "decoder.fc_p.weight": (decoder, 3, 1), "decoder.fc_p.bias": (decoder,),
-        "decoder.fc_out.weight": (1, decoder, 1), "decoder.fc_out.bias": (1,),
+    norms = [f"decoder.block{k}.bn_{i}" for k in range(5) for i in (0, 1)] + ["decoder.bn"]
+    layers: dict[str, tuple[int, ...]] = {
+        "encoder.fc_pos": (2 * hidden, 3), "encoder.fc_c": (code, hidden),
+        "decoder.fc_p": (decoder, 3, 1), "decoder.fc_out": (1, decoder, 1),
     }  # fmt: skip
     for k in range(5):
-        block = f"encoder.block_{k}"
-        shapes |= {
-            f"{block}.fc_0.weight": (hidden, 2 * hidden), f"{block}.fc_0.bias": (hidden,),
-            f"{block}.fc_1.weight": (hidden, hidden), f"{block}.fc_1.bias": (hidden,),
-            f"{block}.shortcut.weight": (hidden, 2 * hidden),
-        }  # fmt: skip
-        for layer in ("fc_0", "fc_1"):
-            shapes[f"decoder.block{k}.{layer}.weight"] = (decoder, decoder, 1)
-            shapes[f"decoder.block{k}.{layer}.bias"] = (decoder,)
-    norms = [f"decoder.block{k}.bn_{i}" for k in range(5) for i in (0, 1)] + ["decoder.bn"]
+        layers[f"encoder.block_{k}.fc_0"] = (hidden, 2 * hidden)
+        layers[f"encoder.block_{k}.fc_1"] = (hidden, hidden)
+        layers |= {f"decoder.block{k}.fc_{i}": (decoder, decoder, 1) for i in (0, 1)}
     for norm in norms:
-        for conv in ("conv_gamma", "conv_beta"):
-            shapes[f"{norm}.{conv}.weight"] = (decoder, code, 1)
-            shapes[f"{norm}.{conv}.bias"] = (decoder,)
-        shapes |= {
-            f"{norm}.bn.running_mean": (decoder,), f"{norm}.bn.running_var": (decoder,),
-            f"{norm}.bn.num_batches_tracked": (),
-        }  # fmt: skip
+        layers |= {f"{norm}.conv_{part}": (decoder, code, 1) for part in ("gamma", "beta")}
+    shapes = {f"{name}.weight": shape for name, shape in layers.items()}
+    shapes |= {f"{name}.bias": shape[:1] for name, shape in layers.items()}
+    shapes |= {f"encoder.block_{k}.shortcut.weight": (hidden, 2 * hidden) for k in range(5)}
+    for norm in norms:
+        shapes |= {f"{norm}.bn.running_{part}": (decoder,) for part in ("mean", "var")}
+        shapes[f"{norm}.bn.num_batches_tracked"] = ()
     return shapes
 
 
@@ -171,19 +161,18 @@ def ball(centre: list[float], radius: float):
 
 
 def test_a_known_field_becomes_its_surface():
-    config = ExtractConfig(coarse=16, levels=2, threshold=0.5)
-    mesh = extract(ball([0.1, -0.05, 0.02], 0.3), config)
+    mesh = extract(ball([0.1, -0.05, 0.02], 0.3), coarse=16, threshold=0.5)
     assert is_closed(mesh.faces)
     assert signed_volume(mesh) == pytest.approx(4 / 3 * math.pi * 0.027, rel=0.01)
     radii = (mesh.verts - torch.tensor([0.1, -0.05, 0.02])).norm(dim=-1)
     assert (radii - 0.3).abs().max() < 0.002
-    loose = extract(ball([0.0, 0, 0], 0.3), ExtractConfig(16, 2, threshold=0.2))
+    loose = extract(ball([0.0, 0, 0], 0.3), coarse=16)
     low, high = box(loose.verts)
     assert float((high - low).mean()) / 2 == pytest.approx(0.3 + math.log(4) / 20, abs=0.003)
 
 
 def test_what_leaves_the_box_is_closed_at_its_walls():
-    mesh = extract(lambda p: p[:, 1] * 10, ExtractConfig(8, 1, threshold=0.5))
+    mesh = extract(lambda p: p[:, 1] * 10, coarse=8, levels=1, threshold=0.5)
     assert is_closed(mesh.faces)
     assert signed_volume(mesh) == pytest.approx(1.1 * 1.1 * 0.55, rel=0.15)
 
@@ -197,9 +186,9 @@ def test_refinement_finds_what_the_dense_grid_finds_with_few_points():
         return 0.18 - (p[:, None] - centres).norm(dim=-1).amin(1)
 
     counted: list[int] = []
-    sparse = refined(field, SMALL)
+    sparse = refined(field, coarse=8, levels=2)
     assert sum(counted) < 0.5 * 33**3
-    dense = refined(field, ExtractConfig(coarse=32, levels=0))
+    dense = refined(field, coarse=32, levels=0)
     assert torch.equal(sparse > 0, dense > 0)
     near = dense.abs() < 0.01
     torch.testing.assert_close(sparse[near], dense[near])
@@ -207,7 +196,7 @@ def test_refinement_finds_what_the_dense_grid_finds_with_few_points():
 
 def test_nothing_inside_is_an_error():
     with pytest.raises(ValueError, match="nothing is inside"):
-        extract(lambda p: -5 * torch.ones(len(p)), SMALL)
+        extract(lambda p: -5 * torch.ones(len(p)))
 
 
 def test_the_shape_comes_back_in_its_own_box_and_axes(monkeypatch: pytest.MonkeyPatch):
@@ -227,7 +216,7 @@ def test_the_shape_comes_back_in_its_own_box_and_axes(monkeypatch: pytest.Monkey
     monkeypatch.setattr(OccupancyNetwork, "decode", decode)
     network = OccupancyNetwork({})
     verts = CORNER.verts * torch.tensor([2.0, 1.0, 4.0])
-    closed = occupied_mesh(network, Mesh(verts, CORNER.faces), SMALL)
+    closed = occupied_mesh(network, Mesh(verts, CORNER.faces))
     assert is_closed(closed.faces)
     assert signed_volume(closed) > 0
     torch.testing.assert_close(torch.stack(box(closed.verts)), torch.stack(box(verts)))

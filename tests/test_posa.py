@@ -86,6 +86,11 @@ def files(tmp_path_factory):
     return folder
 
 
+@pytest.fixture
+def posa(files):
+    return load_posa(files / "contact.pt", files / "mesh_ds")
+
+
 def smplx_people(turn=(0.0, 0.4, 0.0)):
     verts = np.resize(open_person()[0], (10475, 3))
     verts = torch.from_numpy(verts).float() @ axis_angle(torch.tensor(turn)).mT
@@ -195,16 +200,14 @@ def test_bodies_in_a_cameras_axes_are_upright_by_its_tilt(files, tmp_path, monke
         find_posa(in_camera, *paths, None)
 
 
-def test_samples_average_random_codes(files):
-    posa = load_posa(files / "contact.pt", files / "mesh_ds")
+def test_samples_average_random_codes(posa):
     bodies = smplx_people()
     drawn = posa_contacts(posa, bodies, 3, seed=1)
     assert torch.equal(drawn, posa_contacts(posa, bodies, 3, seed=1))
     assert not torch.equal(drawn, posa_contacts(posa, bodies, 3, seed=2))
 
 
-def test_the_decoder_is_the_published_one_layer_by_layer(files):
-    posa = load_posa(files / "contact.pt", files / "mesh_ds")
+def test_the_decoder_is_the_published_one_layer_by_layer(posa):
     draw = np.random.default_rng(5)
     x = torch.from_numpy(draw.normal(size=(2, 655, 3))).float()
     z = torch.from_numpy(draw.normal(size=256)).float()
@@ -234,19 +237,19 @@ def test_semantic_weights_have_their_own_count(files, tmp_path):
     assert posa_contacts(posa, smplx_people()).shape == (1, 10475)
 
 
-def test_other_networks_and_bodies_are_refused(files, tmp_path):
+def test_other_networks_and_bodies_are_refused(files, posa, tmp_path):
     state = write_checkpoint(tmp_path / "a.pt")
     state["extra"] = torch.zeros(3)
     torch.save({"model_state_dict": state}, tmp_path / "b.pt")
     (tmp_path / "c.pt").write_text("no")
     meshes = files / "mesh_ds"
     for name, folder, words in (
-        ("b.pt", meshes, "1875012 numbers"), ("c.pt", meshes, "no checkpoint"),
+        ("b.pt", meshes, "1875012 numbers"), ("c.pt", meshes, "broken torch file"),
         ("a.pt", tmp_path, r"mesh_2\.obj"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=words):
             load_posa(tmp_path / name, folder)
-    posa, bodies = load_posa(tmp_path / "a.pt", files / "mesh_ds"), smplx_people()
+    bodies = smplx_people()
     for error, words, change in (
         (InputError, "meshes only", {"pose": None}),
         (InputError, "100 vertices", {"verts": bodies.verts[:, :100]}),

@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from make_keypoints import rest_pose
-from make_smpl import make_model, write_npz
+from make_keypoints import random_pose
 from scipy import sparse
 
 from mover.bodies.smpl_files import FOLDER, load_smpl
@@ -17,33 +16,16 @@ from mover.fitting.start import _by_matrix
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    root = tmp_path_factory.mktemp("models")
-    for name in ("smpl", "smplx"):
-        write_npz(make_model(name), root / name / f"{name.upper()}_NEUTRAL.npz")
-    return root
-
-
-@pytest.fixture(scope="module")
-def models(folder):
-    files = {name: folder / name / f"{name.upper()}_NEUTRAL.npz" for name in ("smpl", "smplx")}
-    return {name: load_smpl(name, place=file) for name, file in files.items()}
+def models(smpl_models):
+    return {name: load_smpl(name, place=smpl_models) for name in ("smpl", "smplx")}
 
 
 def people(model, bodies=3, seed=0):
     """One person in several poses."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def some(*shape):
-        return torch.randn(*shape, generator=generator)
-
-    zero = rest_pose(bodies, model)
-    angles = 0.25 * some(*zero.body_pose.shape)
+    some = random_pose(model, bodies, seed, size=0.25)
+    angles = some.body_pose.clone()
     angles[:, 63:] = 0
-    return replace(
-        zero, betas=some(1, 10).expand(bodies, 10).clone(), global_orient=some(bodies, 3),
-        body_pose=angles, transl=some(bodies, 3),
-    )  # fmt: skip
+    return replace(some, betas=some.betas[:1].expand(bodies, 10).clone(), body_pose=angles)
 
 
 def official(path, dense, key="mtx"):
@@ -53,7 +35,7 @@ def official(path, dense, key="mtx"):
 
 
 @pytest.fixture(scope="module")
-def matrix_file(models, folder):
+def matrix_file(models, smpl_models):
     """The nearest three vertices in the T-pose; columns behind them act on normals."""
     from scipy.spatial import KDTree
 
@@ -63,7 +45,7 @@ def matrix_file(models, folder):
     rows = np.repeat(np.arange(len(second)), 3)
     values = (share / share.sum(1, keepdims=True)).ravel()
     dense = sparse.coo_matrix((values, (rows, near.ravel())), shape=(10475, 13780))
-    return official(folder / "transfer_data" / "smpl2smplx_deftrafo_setup.pkl", dense)
+    return official(smpl_models / "transfer_data" / "smpl2smplx_deftrafo_setup.pkl", dense)
 
 
 @pytest.fixture(scope="module")

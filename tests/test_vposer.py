@@ -21,63 +21,44 @@ from mover.fitting.prior import (
 )
 from mover.geometry.rotations import axis_angle
 
-
-class First(nn.Module):
-    """The first version's network, as its publication describes it."""
-
-    def __init__(self):
-        super().__init__()
-        self.bodyprior_enc_bn1 = nn.BatchNorm1d(63)
-        self.bodyprior_enc_fc1 = nn.Linear(63, 512)
-        self.bodyprior_enc_bn2 = nn.BatchNorm1d(512)
-        self.bodyprior_enc_fc2 = nn.Linear(512, 512)
-        self.bodyprior_enc_mu, self.bodyprior_enc_logvar = nn.Linear(512, 32), nn.Linear(512, 32)
-        self.bodyprior_dec_fc1 = nn.Linear(32, 512)
-        self.bodyprior_dec_fc2 = nn.Linear(512, 512)
-        self.bodyprior_dec_out = nn.Linear(512, 126)
-
-    def forward(self, z):
-        x = nn.functional.leaky_relu(self.bodyprior_dec_fc1(z), 0.2)
-        x = nn.functional.leaky_relu(self.bodyprior_dec_fc2(x), 0.2)
-        return self.bodyprior_dec_out(x)
+VERSIONS = {
+    "v1": ("TR00_E096.pt", 0.2, [f"bodyprior_dec_{name}" for name in ("fc1", "fc2", "out")]),
+    "v2": ("V02_05_epoch=13.ckpt", 0.01, [f"vp_model.decoder_net.{k}" for k in (0, 3, 5)]),
+}
+"""File, slope of the leaky ReLU and names of the layers, as the publications describe them."""
+SIZES = ((512, 32), (512, 512), (126, 512))
 
 
-class Second(nn.Module):
-    """The second version's: a decoder in a row."""
-
-    def __init__(self):
-        super().__init__()
-        self.vp_model = nn.ModuleDict({"decoder_net": nn.Sequential(
-            nn.Linear(32, 512), nn.LeakyReLU(), nn.Dropout(0.1), nn.Linear(512, 512),
-            nn.LeakyReLU(), nn.Linear(512, 126),
-        )})  # fmt: skip
-
-    def forward(self, z):
-        return self.vp_model["decoder_net"](z)
-
-
-@pytest.fixture(params=["v1", "v2"])
+@pytest.fixture(params=VERSIONS)
 def both(request, tmp_path):
-    torch.manual_seed(0)
-    net = (First() if request.param == "v1" else Second()).eval()
-    last = net.bodyprior_dec_out if request.param == "v1" else net.vp_model["decoder_net"][5]
-    with torch.no_grad():  # poses of bodies, far from half turns
-        last.weight.mul_(6)
-        last.bias.copy_(torch.eye(3)[:, :2].reshape(6).repeat(21))
+    """What the network makes of codes: two columns a joint; and the folder of its weights."""
+    file, slope, names = VERSIONS[request.param]
+    draw = torch.Generator().manual_seed(0)
+    state = {"bodyprior_enc_fc1.weight": torch.zeros(512, 63)}  # of the encoder, which is not used
+    for name, (wide, deep) in zip(names, SIZES, strict=True):
+        state[f"{name}.weight"] = torch.randn(wide, deep, generator=draw) / (3 * deep) ** 0.5
+        state[f"{name}.bias"] = torch.randn(wide, generator=draw) / (3 * deep) ** 0.5
+    state[f"{names[2]}.weight"] *= 6  # poses of bodies, far from half turns
+    state[f"{names[2]}.bias"] = torch.eye(3)[:, :2].reshape(6).repeat(21)
+
+    def columns(z):
+        for k, name in enumerate(names):
+            z = z if k == 0 else nn.functional.leaky_relu(z, slope)
+            z = nn.functional.linear(
+                z, *(state[f"{name}.{p}"].double() for p in ("weight", "bias"))
+            )
+        return z.reshape(-1, 21, 3, 2)
+
     folder = tmp_path / "vposer" / "snapshots"
     folder.mkdir(parents=True)
-    if request.param == "v1":
-        torch.save(net.state_dict(), folder / "TR00_E096.pt")
-    else:
-        state = {"state_dict": net.state_dict(), "epoch": 3}
-        torch.save(state, folder / "V02_05_epoch=13.ckpt")
-    return net, tmp_path / "vposer"
+    torch.save(state if request.param == "v1" else {"state_dict": state, "epoch": 3}, folder / file)
+    return columns, tmp_path / "vposer"
 
 
 def test_our_decoder_gives_the_rotations_of_the_network(both):
-    net, folder = both
+    columns_of, folder = both
     z = torch.randn(5, 32, generator=torch.Generator().manual_seed(1)).double()
-    columns = net.double()(z).detach().reshape(5, 21, 3, 2)
+    columns = columns_of(z)
     turns = decoded(load_vposer(folder), z)
     first = columns[..., 0] / columns[..., 0].norm(dim=-1, keepdim=True)
     torch.testing.assert_close(turns[..., 0], first, atol=1e-5, rtol=0)
@@ -120,12 +101,12 @@ def test_a_fit_with_the_learned_prior_runs_and_only_knows_its_poses(both):
 def test_files_that_are_not_vposer_are_refused(tmp_path):
     torch.save({"other.weight": torch.zeros(3)}, tmp_path / "a.pt")
     (tmp_path / "empty").mkdir()
-    torch.save(First(), tmp_path / "whole.pt")  # a pickled object, which would run code
+    torch.save(nn.Linear(2, 3), tmp_path / "whole.pt")  # a pickled object, which would run code
     for name, words in (
         ("a.pt", r"a\.pt: has no 'decoder_net\.0\.weight', found other"),
-        ("none.pt", "does not exist"),
+        ("none.pt", "no such file, expected VPoser"),
         ("empty", "expected VPoser's snapshots"),
-        ("whole.pt", "cannot be read as plain weights"),
+        ("whole.pt", r"the pickle holds torch\.nn\.modules\.linear\.Linear, expected tensors"),
     ):
         with pytest.raises(InputError, match=words):
             load_vposer(tmp_path / name)

@@ -32,8 +32,7 @@ def has_mean_shape(pose: BodyPose) -> bool:
 class Correction:
     """How bodies are moved; zero leaves them where they are."""
 
-    shift: Float[Tensor, "bodies 3"]
-    """Of the pelvis [m]."""
+    shift: Float[Tensor, "bodies 3"]  #: of the pelvis [m]
     turn: Float[Tensor, "bodies 3"]
     """Of the whole body about its pelvis, an axis-angle vector in the world [rad]."""
     angles: Float[Tensor, "bodies angles"]
@@ -44,16 +43,13 @@ class Correction:
 class Puppet:
     """Some rows of the bodies, ready to be moved."""
 
-    model: BodyModel | None
-    """Of the picked vertices only; None: rigid."""
+    model: BodyModel | None  #: of the picked vertices only; None: rigid
     pose: BodyPose | None
-    skin: Float[Tensor, "bodies picked 3"]
-    """Picked vertices as they were given [m]."""
+    skin: Float[Tensor, "bodies picked 3"]  #: picked vertices as they were given [m]
     normals: Float[Tensor, "bodies picked 3"]
     points: Float[Tensor, "bodies points 3"]
     """Joints as they were given, or vertices that stand for them [m]; the first is the pivot."""
-    joints: Int[Tensor, " known"]
-    """Which joints of the model they are; none of a bare mesh."""
+    joints: Int[Tensor, " known"]  #: which joints of the model they are; none of a bare mesh
 
 
 @record

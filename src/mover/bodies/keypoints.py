@@ -98,8 +98,7 @@ class Spots:
     share: Float[Tensor, "keypoints 3"]
     joint: Int[Tensor, " keypoints"]
     """The joint that a keypoint is; -1: it is a mixture of vertices."""
-    there: Bool[Tensor, " keypoints"]
-    """Keypoints that the model has."""
+    there: Bool[Tensor, " keypoints"]  #: keypoints that the model has
 
 
 def keypoints_of(
@@ -127,11 +126,7 @@ def keypoints_of(
 
 @lru_cache(maxsize=16)
 def spots_of(model: BodyModel, layout: str) -> Spots:
-    """Where the keypoints of a layout are on this model.
-
-    Raises:
-        ValueError: If there is no such layout.
-    """
+    """Where the keypoints of a layout are on this model; see `keypoints_of`."""
     if layout not in LAYOUTS:
         raise ValueError(f"no layout '{layout}', known are {', '.join(LAYOUTS)}")
     names = LAYOUTS[layout]

@@ -56,8 +56,7 @@ FAR = 0.15  # [m], a vertex that is farther from the open body belongs to no par
 class BodyParts:
     """Which part of the body each vertex belongs to."""
 
-    part_of: Int[Tensor, " verts"]
-    """Index into `PARTS`; -1: none."""
+    part_of: Int[Tensor, " verts"]  #: index into `PARTS`; -1: none
     rings: Int[Tensor, "landmarks members"]
     """Vertices around each of `LANDMARKS`: their mean is about where the joint is. Empty where the
     topology is unknown."""

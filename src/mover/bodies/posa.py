@@ -22,6 +22,7 @@ from torch import Tensor
 from torch.nn.functional import group_norm, linear
 
 from mover.core.errors import InputError
+from mover.core.pickles import load_weights
 from mover.core.records import BROKEN
 from mover.core.types import Bodies
 from mover.geometry.rotations import axis_angle, rot_x
@@ -137,15 +138,11 @@ def _sparse(path: Path, shape: tuple[int, int]) -> Tensor:
 class Posa:
     """A decoder and the meshes that it works on."""
 
-    weights: dict[str, Tensor]
-    """Of the decoder."""
+    weights: dict[str, Tensor]  #: of the decoder
     spirals: Int[Tensor, "coarse 9"]
-    down: tuple[Tensor, ...]
-    """Sparse matrices from the full body to coarser meshes, in order."""
-    up: tuple[Tensor, ...]
-    """Sparse matrices back, in order."""
-    channels: int
-    """1: contact; 43: contact and the kind of object."""
+    down: tuple[Tensor, ...]  #: sparse matrices from the full body to coarser meshes, in order
+    up: tuple[Tensor, ...]  #: sparse matrices back, in order
+    channels: int  #: 1: contact; 43: contact and the kind of object
 
 
 def load_posa(weights: Path, meshes: Path) -> Posa:
@@ -154,16 +151,11 @@ def load_posa(weights: Path, meshes: Path) -> Posa:
     Raises:
         InputError: If a file is missing, or is not what the published network needs.
     """
-    try:
-        tree: Any = torch.load(weights, map_location="cpu", weights_only=True)
-    except Exception as error:  # a broken file may raise anything
-        raise InputError(f"{weights.name}: no checkpoint can be read from it ({error})") from error
-    tree = tree.get("model_state_dict", tree) if isinstance(tree, dict) else {}
-    state = {k: v for k, v in tree.items() if isinstance(v, Tensor)}
+    state = load_weights(weights, "model_state_dict", "POSA's network")
     channels = len(state.get(f"{DECODER}.5.layer.weight", ()))
     if channels not in COUNTS:
         raise InputError(f"{weights.name}: no POSA network in it, expected '{DECODER}.5.layer'")
-    decoder = {k: v.float() for k, v in state.items() if k.startswith("decoder.")}
+    decoder = {k: v for k, v in state.items() if k.startswith("decoder.")}
     found = sum(v.numel() for v in state.values()), sum(v.numel() for v in decoder.values())
     if found != COUNTS[channels]:
         raise InputError(

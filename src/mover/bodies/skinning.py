@@ -39,8 +39,7 @@ Turns = Float[Tensor, "bodies joints 3 3"]
 class Hands:
     """The space of hand poses; the first axis is left, right."""
 
-    mean: Float[Tensor, "2 45"]
-    """Axis-angle vectors of a relaxed hand [rad]."""
+    mean: Float[Tensor, "2 45"]  #: axis-angle vectors of a relaxed hand [rad]
     components: Float[Tensor, "2 components 45"]
     """Principal components of hand poses, one a row [rad]."""
 
@@ -62,16 +61,13 @@ class SkinnedBody:
     joint_names: tuple[str, ...]
     parents: tuple[int, ...]
     """Index of each joint's parent, always an earlier one; -1 for the root."""
-    verts: Float[Tensor, "verts 3"]
-    """The rest shape [m]."""
-    joints: Float[Tensor, "joints 3"]
-    """Places of the joints in the rest shape [m]."""
+    verts: Float[Tensor, "verts 3"]  #: the rest shape [m]
+    joints: Float[Tensor, "joints 3"]  #: places of the joints in the rest shape [m]
     weights: Float[Tensor, "verts joints"]
     """Share of each joint in the motion of a vertex; rows sum to 1."""
     shape_dirs: Float[Tensor, "verts 3 shape"]
     """Displacement of the rest shape for one unit of each shape coefficient [m]."""
-    joint_dirs: Float[Tensor, "joints 3 shape"]
-    """The same for the joints [m]."""
+    joint_dirs: Float[Tensor, "joints 3 shape"]  #: the same for the joints [m]
     tpose: Float[Tensor, "joints 3 3"]
     """Turns the parts of the rest shape, bone by bone, into the zero pose."""
 
@@ -92,7 +88,8 @@ class SkinnedBody:
         unless `pose.extra["flat_hand_mean"]` says that the hands are turned from flat ones.
 
         Raises:
-            InputError: If the numbers of coefficients or angles are not this model's.
+            InputError: If the numbers of coefficients or angles are not this model's (here, and in
+                all functions below that look at these).
         """
         turns = axis_angle(angles_of(self, with_full_hands(self, pose)))
         verts, joints = self.rest(turns, pose.betas, pose.extra.get("expression"))
@@ -104,11 +101,7 @@ class SkinnedBody:
         betas: Float[Tensor, "bodies shape"],
         face: Float[Tensor, "bodies expression"] | None,
     ) -> Posed:
-        """Rest shape and joints with the correctives of pose and expression [m].
-
-        Raises:
-            InputError: If there are more coefficients than the model knows.
-        """
+        """Rest shape and joints with the correctives of pose and expression [m]."""
         verts, joints = shaped(self, betas)
         most = 0 if self.expression_dirs is None else self.expression_dirs.shape[-1]
         if face is not None and self.expression_dirs is not None and most:
@@ -160,11 +153,7 @@ def growth_of(model: SkinnedBody) -> Float[Tensor, " shape"]:
 
 
 def with_full_hands(model: SkinnedBody, pose: BodyPose) -> BodyPose:
-    """The same pose with hands as 45 angles each, the mean hand added; SMPL's palms stay straight.
-
-    Raises:
-        InputError: If there are more components than the model has.
-    """
+    """The pose with hands as 45 angles each, the mean hand added; SMPL's palms stay straight."""
     body = pose.body_pose
     if model.name == "smpl" and body.shape[-1] == 63:
         body = torch.cat([body, body.new_zeros(len(body), 6)], -1)
@@ -227,11 +216,7 @@ def widths_of(model: SkinnedBody) -> dict[str, int]:
 
 
 def angles_of(model: SkinnedBody, pose: BodyPose) -> Float[Tensor, "bodies joints 3"]:
-    """Axis-angle vectors of all joints; parts that are not given stay straight.
-
-    Raises:
-        InputError: If a part has another number of angles.
-    """
+    """Axis-angle vectors of all joints; parts that are not given stay straight."""
     bodies = pose.global_orient.shape[0]
     given = {**pose.extra, "global_orient": pose.global_orient, "body_pose": pose.body_pose}
     rows: list[Tensor] = []
@@ -247,11 +232,7 @@ def angles_of(model: SkinnedBody, pose: BodyPose) -> Float[Tensor, "bodies joint
 
 
 def shaped(model: SkinnedBody, betas: Float[Tensor, "bodies shape"]) -> Posed:
-    """Rest shape and joints of each person [m]; shape coefficients that are not given are 0.
-
-    Raises:
-        InputError: If there are more than the model knows.
-    """
+    """Rest shape and joints of each person [m]; shape coefficients that are not given are 0."""
     count, most = betas.shape[-1], model.shape_dirs.shape[-1]
     if count > most and (betas[..., most:] != 0).any():
         raise InputError(

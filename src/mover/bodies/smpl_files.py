@@ -49,11 +49,7 @@ def keys_of(name: str) -> tuple[str, ...]:
 
 
 def body_from(arrays: Mapping[str, Any], name: str, gender: str, file: str) -> SkinnedBody:
-    """The body model in the arrays of a file.
-
-    Raises:
-        InputError: If an array is missing or does not have the model's shape.
-    """
+    """The body model in the arrays of a file, which are checked first."""
     kind = KINDS[name]
     _check_model(arrays, name, file)
     verts, joints = kind.verts, len(kind.joints)
@@ -64,6 +60,17 @@ def body_from(arrays: Mapping[str, Any], name: str, gender: str, file: str) -> S
     weights = _numbers(arrays, "weights", (verts, joints), file)
     shape, expression = _split(dirs, name, file)
     faces = _indices(arrays, "f", (None, 3), verts, file)
+    hands = face = None
+    if kind.hands:
+        components = [_numbers(arrays, key, (None, 45), file) for key in HAND_KEYS[:2]]
+        mean = [_numbers(arrays, key, (45,), file) for key in HAND_KEYS[2:]]
+        if len(components[0]) != len(components[1]):
+            raise InputError(f"{file}: fields 'hands_componentsl' and 'hands_componentsr' differ")
+        hands = Hands(_tensor(np.stack(mean)), _tensor(np.stack(components)))
+    if all(key in arrays for key in FACE_KEYS):
+        index = _indices(arrays, "lmk_faces_idx", (51,), len(faces), file)
+        share = _numbers(arrays, "lmk_bary_coords", (51, 3), file)
+        face = FacePoints(torch.from_numpy(faces[index]), _tensor(share))
     at_joints = (regressor @ dirs.reshape(verts, -1)).reshape(joints, 3, -1)
     return SkinnedBody(
         name=name, faces=torch.from_numpy(faces), joint_names=kind.joints,
@@ -73,8 +80,7 @@ def body_from(arrays: Mapping[str, Any], name: str, gender: str, file: str) -> S
         tpose=torch.eye(3).expand(joints, 3, 3).clone(),
         pose_dirs=_tensor(poses.transpose(2, 0, 1)), expression_dirs=_tensor(dirs[..., expression]),
         expression_joint_dirs=_tensor(at_joints[..., expression]),
-        hands=_hands(arrays, file) if kind.hands else None, face=_face(arrays, faces, file),
-        gender=gender,
+        hands=hands, face=face, gender=gender,
     )  # fmt: skip
 
 
@@ -104,11 +110,7 @@ def _check_model(arrays: Mapping[str, Any], name: str, file: str) -> None:
 def _numbers(
     arrays: Mapping[str, Any], key: str, shape: tuple[int | None, ...], file: str
 ) -> NDArray[np.float64]:
-    """An array of finite numbers of this shape; None stands for any size.
-
-    Raises:
-        InputError: If it is anything else.
-    """
+    """An array, if it is one of finite numbers of this shape; None stands for any size."""
     value = arrays[key]
     if hasattr(value, "toarray") and _fits(value.shape, shape):  # else it may be huge
         value = value.toarray()
@@ -166,23 +168,6 @@ def _split(dirs: NDArray[np.float64], name: str, file: str) -> tuple[slice, slic
     return slice(0, SHAPE_1_1), slice(SHAPE_1_1, count)
 
 
-def _hands(arrays: Mapping[str, Any], file: str) -> Hands:
-    components = [_numbers(arrays, key, (None, 45), file) for key in HAND_KEYS[:2]]
-    mean = [_numbers(arrays, key, (45,), file) for key in HAND_KEYS[2:]]
-    if len(components[0]) != len(components[1]):
-        raise InputError(f"{file}: fields 'hands_componentsl' and 'hands_componentsr' differ")
-    return Hands(_tensor(np.stack(mean)), _tensor(np.stack(components)))
-
-
-def _face(arrays: Mapping[str, Any], faces: NDArray[np.int64], file: str) -> FacePoints | None:
-    """Points of the face where the file has them."""
-    if any(key not in arrays for key in FACE_KEYS):
-        return None
-    index = _indices(arrays, "lmk_faces_idx", (51,), len(faces), file)
-    share = _numbers(arrays, "lmk_bary_coords", (51, 3), file)
-    return FacePoints(torch.from_numpy(faces[index]), _tensor(share))
-
-
 FOLDER = "MOVER_BODY_MODELS"
 """Environment variable with the folder of the user's body models."""
 ENDINGS = (".npz", ".pkl")
@@ -213,11 +198,7 @@ def load_smpl(name: str, gender: str = "neutral", place: Path | None = None) -> 
 
 
 def find_file(name: str, gender: str, place: Path | None = None) -> Path:
-    """The user's file of a model.
-
-    Raises:
-        InputError: If there is none; the message names where it was looked for.
-    """
+    """The user's file of a model; an error names where it was looked for."""
     if place is None:
         given = os.environ.get(FOLDER)
         if not given:

@@ -15,8 +15,7 @@ class Energy:
     """Weighted terms of an objective, before any sum over the items (objects or frames)."""
 
     parts: Mapping[str, PerItem]
-    whole: PerItem | None = None
-    """Their sum, where it is known."""
+    whole: PerItem | None = None  #: their sum, where it is known
 
     @property
     def per_item(self) -> PerItem:

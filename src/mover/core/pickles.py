@@ -125,6 +125,28 @@ def _of_torch(data: bytes) -> Any:  # noqa: ANN401
     return value
 
 
+def load_weights(path: Path, field: str, expected: str) -> dict[str, torch.Tensor]:
+    """The tensors of a checkpoint by name, under a field where it has that; nothing in it runs.
+
+    Raises:
+        InputError: If the file is missing or broken, or holds no tensors by name.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file, expected {expected}")
+    try:
+        tree = _of_torch(path.read_bytes())
+    except InputError as error:
+        raise InputError(f"{path.name}: {error}") from error
+    except Exception as error:  # torch raises what the damage happens to cause
+        raise unreadable(path, error, expected) from error
+    tree = tree.get(field, tree) if isinstance(tree, dict) else tree
+    named = tree.items() if isinstance(tree, dict) else ()
+    state = {str(k): v.detach().float() for k, v in named if isinstance(v, torch.Tensor)}
+    if not state:
+        raise InputError(f"{path.name}: holds no parameters by name, expected {expected}")
+    return state
+
+
 class Row(tuple[Any, ...]):
     """A tuple that is a key only if its hash is quick: of numbers and text, not of more tuples."""
 

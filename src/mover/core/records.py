@@ -97,38 +97,37 @@ def rows_of(value: T, rows: Tensor, *axes: str) -> T:
         axes: Names in the annotations, by default `bodies` and `rows`.
     """
     index = rows.nonzero()[:, 0] if rows.dtype == torch.bool else rows
-    found: dict[str, Any] = {}
-    for field in dataclasses.fields(typing.cast(Any, value)):
-        part, axis = getattr(value, field.name), axis_of(field.type, axes or ("bodies", "rows"))
-        if isinstance(part, Tensor) and axis is not None:
-            found[field.name] = part.index_select(axis, index)
-        elif isinstance(part, dict):
-            found[field.name] = {
-                name: one[index] if isinstance(one, Tensor) else one for name, one in part.items()
-            }
-        elif isinstance(part, tuple) and all(isinstance(one, bytes) for one in part) and part:
-            found[field.name] = tuple(part[row] for row in index.tolist())
-        elif isinstance(part, tuple) and all(dataclasses.is_dataclass(one) for one in part):
-            found[field.name] = tuple(rows_of(one, index, *axes) for one in part)
-        elif dataclasses.is_dataclass(part):
-            found[field.name] = rows_of(part, index, *axes)
-    return dataclasses.replace(typing.cast(Any, value), **found)
+    return _by_rows(lambda axis, part: part.index_select(axis, index.to(part.device)), axes, value)
 
 
 def with_rows(value: T, rows: Tensor, part: T, *axes: str) -> T:
     """The record with the rows of another in place of some of its own, as `rows_of` takes them."""
+    return _by_rows(
+        lambda axis, a, b: a.index_copy(axis, rows.to(a.device), b.to(a)), axes, value, part
+    )
+
+
+def _by_rows(fn: Callable[..., Tensor], axes: tuple[str, ...], value: T, *others: T) -> T:
+    """A record of what `fn` makes of the rows of each part, by their axis, of one or more."""
     found: dict[str, Any] = {}
     for field in dataclasses.fields(typing.cast(Any, value)):
-        old, new = getattr(value, field.name), getattr(part, field.name)
+        part, *more = (getattr(one, field.name) for one in (value, *others))
         axis = axis_of(field.type, axes or ("bodies", "rows"))
-        if isinstance(old, Tensor) and axis is not None:
-            found[field.name] = old.index_copy(axis, rows, new.to(old))
-        elif isinstance(old, dict):
-            found[field.name] = {
-                n: one.index_copy(0, rows, new[n].to(one)) for n, one in old.items()
-            }
-        elif dataclasses.is_dataclass(old):
-            found[field.name] = with_rows(old, rows, new, *axes)
+        if isinstance(part, Tensor) and axis is not None:
+            part = fn(axis, part, *more)
+        elif isinstance(part, dict):
+            tensors = {n: fn(0, one, *(other[n] for other in more))
+                       for n, one in part.items() if isinstance(one, Tensor)}  # fmt: skip
+            part = part | tensors
+        elif isinstance(part, tuple) and part and all(isinstance(one, bytes) for one in part):
+            masks = [mask for one in (part, *more) for mask in one]
+            numbers = torch.arange(len(masks)).split([len(one) for one in (part, *more)])
+            part = tuple(masks[row] for row in fn(0, *numbers).tolist())
+        elif isinstance(part, tuple) and all(dataclasses.is_dataclass(one) for one in part):
+            part = tuple(_by_rows(fn, axes, *each) for each in zip(part, *more, strict=True))
+        elif dataclasses.is_dataclass(part):
+            part = _by_rows(fn, axes, part, *more)
+        found[field.name] = part
     return dataclasses.replace(typing.cast(Any, value), **found)
 
 

@@ -33,12 +33,9 @@ class StageLog:
 
     name: str
     seconds: float
-    peak_memory: float
-    """Peak resident memory of the process until then [MB]."""
-    kept: bool
-    """True: read from disk, not computed."""
-    fingerprint: str = ""
-    """Name of its files in stages/<name>."""
+    peak_memory: float  #: peak resident memory of the process until then [MB]
+    kept: bool  #: True: read from disk, not computed
+    fingerprint: str = ""  #: name of its files in stages/<name>
 
 
 @dataclass(frozen=True)

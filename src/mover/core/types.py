@@ -14,8 +14,7 @@ from mover.core.records import record
 class Camera:
     """A pinhole camera, still at the world origin (x right, y down, z forward); picture in [px]."""
 
-    K: Float[Tensor, "3 3"]
-    """Intrinsics [px]; the centre of the top-left pixel is (0.5, 0.5)."""
+    K: Float[Tensor, "3 3"]  #: intrinsics [px]; the centre of the top-left pixel is (0.5, 0.5)
     R_cam_world: Float[Tensor, "3 3"]
     """Maps world (+y up, viewing direction without x) to camera axes."""
     width: int
@@ -35,10 +34,8 @@ class Segment:
     """Where an object stands from a frame on, until its next segment begins."""
 
     frame: int
-    t_world_object: Float[Tensor, "3"]
-    """Place of the mesh origin in the world [m]."""
-    yaw: Float[Tensor, ""]
-    """[rad]"""
+    t_world_object: Float[Tensor, "3"]  #: place of the mesh origin in the world [m]
+    yaw: Float[Tensor, ""]  #: [rad]
     mover: int | None = None
     """The person with whom it moves, held by hand or sat on; None: it stands."""
 
@@ -47,11 +44,9 @@ class Segment:
 class SeatStretch:
     """How the middle of a mesh is raised to where people sit; its bottom and its top stay."""
 
-    bottom: Float[Tensor, "*items"]
-    """Lowest and highest y, in the mesh's coordinates."""
+    bottom: Float[Tensor, "*items"]  #: lowest and highest y, in the mesh's coordinates
     top: Float[Tensor, "*items"]
-    rise: Float[Tensor, "*items"]
-    """Points at the share t of the height go up by 2 t (1 - t) of it."""
+    rise: Float[Tensor, "*items"]  #: points at the share t of the height go up by 2 t (1 - t) of it
 
     def of(self, points: Float[Tensor, "*items points 3"]) -> Float[Tensor, "*items points 3"]:
         """Points of the mesh, raised."""
@@ -70,16 +65,11 @@ class SceneObject:
     mesh: Mesh
     mesh_file: str
     """Where the mesh came from; it is copied, and rewritten only where a seat moved (`stretch`)."""
-    annotation: int | None
-    """Id of its annotation in the reference image; None: no image evidence."""
-    support: str
-    """`ground`, `free`, or the id of the object that carries it."""
-    t_world_object: Float[Tensor, "3"]
-    """Place of the mesh origin in the world [m]."""
-    yaw: Float[Tensor, ""]
-    """Right-handed rotation about +y [rad]."""
-    scale: Float[Tensor, "3"]
-    """Factor along each mesh axis."""
+    annotation: int | None  #: id of its annotation in the reference image; None: no image evidence
+    support: str  #: `ground`, `free`, or the id of the object that carries it
+    t_world_object: Float[Tensor, "3"]  #: place of the mesh origin in the world [m]
+    yaw: Float[Tensor, ""]  #: right-handed rotation about +y [rad]
+    scale: Float[Tensor, "3"]  #: factor along each mesh axis
     segments: tuple[Segment, ...] = ()
     """Where it stands when, of an object that is moved; its own position is that of the reference
     image. Empty: it never moves."""
@@ -114,10 +104,8 @@ class Detection:
 
     id: int
     category: str
-    box: Float[Tensor, "4"]
-    """x_min, y_min, x_max, y_max [px]."""
-    mask: Masks | None
-    """One mask; None: only the box is known."""
+    box: Float[Tensor, "4"]  #: x_min, y_min, x_max, y_max [px]
+    mask: Masks | None  #: one mask; None: only the box is known
     score: float
 
 
@@ -128,8 +116,7 @@ class People:
     masks: Masks
     frame: Int[Tensor, " rows"]
     person: Int[Tensor, " rows"]
-    heights: dict[str, float] = field(default_factory=dict)
-    """Known body heights by track [m]."""
+    heights: dict[str, float] = field(default_factory=dict)  #: known body heights by track [m]
 
 
 @record
@@ -157,10 +144,8 @@ class Bodies:
     joint_names: tuple[str, ...]
     frame: Int[Tensor, " bodies"]
     person: Int[Tensor, " bodies"]
-    fps: float | None
-    """Frames a second; None: unordered images."""
-    space: Literal["camera", "world"]
-    """Frame of vertices and joints."""
+    fps: float | None  #: frames a second; None: unordered images
+    space: Literal["camera", "world"]  #: frame of vertices and joints
     pose: BodyPose | None
     size_spread: float | None = None
     """Standard deviation of the logarithm of all sizes, as far as they are wrong together: bodies
@@ -174,10 +159,8 @@ class Keypoints:
     """Joints that a detector saw in the images [px]: one row for each (frame, person)."""
 
     points: Float[Tensor, "rows joints 2"]
-    confidence: Float[Tensor, "rows joints"]
-    """From 0 to 1; 0: the joint is missing."""
-    layout: str
-    """Which joints: a name in `bodies.keypoints.LAYOUTS`."""
+    confidence: Float[Tensor, "rows joints"]  #: from 0 to 1; 0: the joint is missing
+    layout: str  #: which joints: a name in `bodies.keypoints.LAYOUTS`
     frame: Int[Tensor, " rows"]
     person: Int[Tensor, " rows"]
     fps: float | None
@@ -199,8 +182,7 @@ class CameraPath:
     one pose, which is that of the reference image.
     """
 
-    frame: Int[Tensor, " poses"]
-    """Rising."""
+    frame: Int[Tensor, " poses"]  #: rising
     R_reference_camera: Float[Tensor, "poses 3 3"]
     t_reference_camera: Float[Tensor, "poses 3"]
     """In the units of the tool that found the poses until their scale is found, then [m]."""
@@ -223,10 +205,8 @@ class DepthImage:
 class Heading:
     """Along which two directions, at right angles, a room runs: its walls and most furniture."""
 
-    yaw: float
-    """Of one of them about up, seen from the camera [rad]."""
-    spread: float
-    """Standard deviation [rad]."""
+    yaw: float  #: of one of them about up, seen from the camera [rad]
+    spread: float  #: standard deviation [rad]
 
 
 @record
@@ -235,8 +215,7 @@ class Tilt:
 
     pitch: float
     roll: float
-    spread: float
-    """Standard deviation of both."""
+    spread: float  #: standard deviation of both
 
 
 @record
@@ -244,15 +223,11 @@ class Capture:
     """Everything that is known before the method runs; it never holds the truth."""
 
     name: str
-    scene: Scene
-    """The initial scene; its camera holds the first guess of pitch and roll."""
-    camera_height: float | None
-    """Known height of the camera above the floor [m]."""
+    scene: Scene  #: the initial scene; its camera holds the first guess of pitch and roll
+    camera_height: float | None  #: known height of the camera above the floor [m]
     detections: tuple[Detection, ...]
-    reference: Float[Tensor, "h w 3"] | None
-    """The clean reference image, in [0, 1]."""
-    reference_people: Masks | None
-    """People in the reference image: what they hide is unknown."""
+    reference: Float[Tensor, "h w 3"] | None  #: the clean reference image, in [0, 1]
+    reference_people: Masks | None  #: people in the reference image: what they hide is unknown
     bodies: Bodies | None
     people: People | None
     touch: Float[Tensor, "bodies verts"] | None
@@ -262,19 +237,15 @@ class Capture:
     """Visible masks of the objects in some frames, `person` being the number of an annotation."""
     hypotheses: tuple[SceneObject, ...] = ()
     """Other positions and shapes of the scene's objects, under their ids: further starts."""
-    path: CameraPath = STILL
-    """Where the camera was when it saw the people."""
-    depth: DepthImage | None = None
-    """Measured depth of the reference picture."""
+    path: CameraPath = STILL  #: where the camera was when it saw the people
+    depth: DepthImage | None = None  #: measured depth of the reference picture
     focal_spread: float | None = None
     """Standard deviation of the logarithm of the focal length; 0: it was measured. None:
     unknown."""
     focal_by_lines: bool = False
     """Whether the lines of the reference picture have been counted in the focal length."""
-    tilt: Tilt | None = None
-    """Of the camera, where it was looked for in the picture."""
-    heading: Heading | None = None
-    """Of the room's walls, where it was."""
+    tilt: Tilt | None = None  #: of the camera, where it was looked for in the picture
+    heading: Heading | None = None  #: of the room's walls, where it was
 
 
 @record
@@ -286,26 +257,19 @@ class Objects:
     """
 
     ids: tuple[str, ...]
-    categories: tuple[str, ...]
-    """Canonical names."""
+    categories: tuple[str, ...]  #: canonical names
     verts: Float[Tensor, "objects verts 3"]
-    real_verts: Bool[Tensor, "objects verts"]
-    """False where vertices pad."""
+    real_verts: Bool[Tensor, "objects verts"]  #: False where vertices pad
     faces: Int[Tensor, "objects faces 3"]
-    edges: Int[Tensor, "objects edges 4"]
-    """Two vertices and the two faces beside them."""
-    samples: Float[Tensor, "objects samples 3"]
-    """Points spread evenly over the surface [m]."""
-    size: Float[Tensor, "objects 3"]
-    """Edges of the box [m]."""
+    edges: Int[Tensor, "objects edges 4"]  #: two vertices and the two faces beside them
+    samples: Float[Tensor, "objects samples 3"]  #: points spread evenly over the surface [m]
+    size: Float[Tensor, "objects 3"]  #: edges of the box [m]
     top: Float[Tensor, "objects region 3"]
     """Points of the region that carries: a seat, a mattress, a table top [m]."""
-    back: Float[Tensor, "objects region 3"]
-    """Points of the region that one leans against [m]."""
+    back: Float[Tensor, "objects region 3"]  #: points of the region that one leans against [m]
     has_top: Bool[Tensor, " objects"]
     has_back: Bool[Tensor, " objects"]
-    is_seat: Bool[Tensor, " objects"]
-    """People can sit or lie on it."""
+    is_seat: Bool[Tensor, " objects"]  #: people can sit or lie on it
     supports: Int[Tensor, " objects"]
     """-1: the ground, -2: free, else the index of the carrying object."""
 
@@ -314,10 +278,8 @@ class Objects:
 class Layout:
     """Where the objects stand: the unknowns of Eq. 1. Leading axes hold several starts."""
 
-    t_world_object: Float[Tensor, "*starts objects 3"]
-    """Centre of the box's bottom [m]."""
-    yaw: Float[Tensor, "*starts objects"]
-    """Rotation about gravity [rad]."""
+    t_world_object: Float[Tensor, "*starts objects 3"]  #: centre of the box's bottom [m]
+    yaw: Float[Tensor, "*starts objects"]  #: rotation about gravity [rad]
     log_scale: Float[Tensor, "*starts objects 3"]
     """Logarithm of the scale along each object axis; 0 keeps the initial size."""
 
@@ -353,20 +315,14 @@ class Evidence:
     """What held an object in its position."""
 
     id: str
-    mask_pixels: int
-    """Pixels of its mask in the image."""
-    near_pixels: int
-    """Pixels (of an image 640 wide) where people passed in front of it."""
-    far_pixels: int
-    """Pixels where it hid people."""
-    touching_bodies: int
-    """Bodies that touch it."""
+    mask_pixels: int  #: pixels of its mask in the image
+    near_pixels: int  #: pixels (of an image 640 wide) where people passed in front of it
+    far_pixels: int  #: pixels where it hid people
+    touching_bodies: int  #: bodies that touch it
     nearest_body: float | None
     """From its surface to the nearest body of all frames [m]; negative: inside; None: no people."""
-    energy: float
-    """What is left of Eq. 1 where it stands."""
-    terms: dict[str, float]
-    """The same by term of Eq. 1 (`SCENE_TERMS`)."""
+    energy: float  #: what is left of Eq. 1 where it stands
+    terms: dict[str, float]  #: the same by term of Eq. 1 (`SCENE_TERMS`)
 
 
 @record
@@ -375,63 +331,47 @@ class ContactLabels:
 
     frame: Int[Tensor, " rows"]
     person: Int[Tensor, " rows"]
-    part: Int[Tensor, " rows"]
-    """Index into `parts`."""
-    object: Int[Tensor, " rows"]
-    """Index into `objects`."""
-    position: Float[Tensor, "rows 3"]
-    """On the surface of the object, in the world [m]."""
-    normal: Float[Tensor, "rows 3"]
-    """Out of the object there, a unit vector."""
+    part: Int[Tensor, " rows"]  #: index into `parts`
+    object: Int[Tensor, " rows"]  #: index into `objects`
+    position: Float[Tensor, "rows 3"]  #: on the surface of the object, in the world [m]
+    normal: Float[Tensor, "rows 3"]  #: out of the object there, a unit vector
     gap: Float[Tensor, " rows"]
     """From the surface to the nearest vertex of the part [m]; negative: the part is inside."""
     confidence: Float[Tensor, " rows"]
     """From 0 to 1: how near it is, and whether the posture bears on it."""
     parts: tuple[str, ...]
-    objects: tuple[str, ...]
-    """Ids of the scene's objects; the last is `ground`, the floor."""
+    objects: tuple[str, ...]  #: ids of the scene's objects; the last is `ground`, the floor
 
 
 @record
 class Proposal:
     """A support that no detector saw: people rest on it."""
 
-    proposed: SceneObject
-    """Of the library, where they rest; without an annotation."""
-    piece: str
-    """Its name in the library."""
+    proposed: SceneObject  #: of the library, where they rest; without an annotation
+    piece: str  #: its name in the library
     style: int
-    seed: int
-    """Which design, and what drew its sizes."""
-    certainty: float
-    """From 0 to 1; a rule of thumb, not a calibrated chance."""
-    bodies: int
-    """How many bodies rest on it..."""
-    seconds: float
-    """... and for how long [s]."""
+    seed: int  #: which design, and what drew its sizes
+    certainty: float  #: from 0 to 1; a rule of thumb, not a calibrated chance
+    bodies: int  #: how many bodies rest on it...
+    seconds: float  #: ... and for how long [s]
 
 
 @record
 class Room:
     """What `reconstruct` returns."""
 
-    scene: Scene
-    """The refined scene: every object of the input."""
-    initial: Scene
-    """The scene as it was given."""
+    scene: Scene  #: the refined scene: every object of the input
+    initial: Scene  #: the scene as it was given
     image_only: Scene
     """The same objects under the refined camera as the image alone places them (stage 1)."""
-    bodies: Bodies | None
-    """All rows of the input, in the world of `scene`."""
-    kept: Bool[Tensor, " bodies"] | None
-    """Rows that served as evidence."""
+    bodies: Bodies | None  #: all rows of the input, in the world of `scene`
+    kept: Bool[Tensor, " bodies"] | None  #: rows that served as evidence
     proxies: tuple[Mesh, ...]
     """The closed meshes that were optimised, in the coordinates of the pieces' own meshes."""
     evidence: tuple[Evidence, ...]
     covariance: Float[Tensor, "3 3"] | None
     """Of pitch [rad], roll [rad] and ground [m] as the feet give them."""
-    traces: dict[str, Tensor]
-    """Total energy before each step, by stage."""
+    traces: dict[str, Tensor]  #: total energy before each step, by stage
     warnings: tuple[str, ...]
     path: CameraPath = STILL
     """Where the cameras of the frames were, in the axes of that of `scene` [m]."""

@@ -15,7 +15,7 @@ from mover.core.types import Bodies, BodyPose, Camera, Keypoints, rows_by_person
 from mover.fitting import ground, tracks, unknowns
 from mover.fitting.config import FitConfig, Stage
 from mover.fitting.energy import FitState
-from mover.fitting.noise import Bias, at_most, bias_of, noise_of, noisy, without
+from mover.fitting.noise import Bias, at_most, bias_of, noise_of, without
 from mover.fitting.prior import encoded
 from mover.fitting.priors import UNKNOWN, kind_of, lasting_of, stature_of
 from mover.fitting.start import begin, begin_from
@@ -31,11 +31,9 @@ class FitInputs:
     """What bodies are fitted to, and with what."""
 
     keypoints: Keypoints
-    camera: Camera
-    """The true lens; its rotation is the first guess of upright."""
+    camera: Camera  #: the true lens; its rotation is the first guess of upright
     model: SkinnedBody
-    start: Bodies | None = None
-    """Bodies of another tool in the camera frame, with parameters."""
+    start: Bodies | None = None  #: bodies of another tool in the camera frame, with parameters
     prior: unknowns.PosePrior = unknowns.ANGLES
     ground: float | None = None
     """Height of the floor in the camera's world [m], where it is known: no person goes below it."""
@@ -48,10 +46,8 @@ class Fitted:
     """Bodies in the camera frame, and how well they explain the keypoints."""
 
     bodies: Bodies
-    rows: Int[Tensor, " bodies"]
-    """The row of the keypoints of each body."""
-    miss: Float[Tensor, " bodies"]
-    """Root mean square distance of the keypoints that are seen [px]."""
+    rows: Int[Tensor, " bodies"]  #: the row of the keypoints of each body
+    miss: Float[Tensor, " bodies"]  #: root mean square distance of the keypoints that are seen [px]
     warnings: tuple[str, ...]
 
 
@@ -116,8 +112,7 @@ def _on_a_floor(state: FitState, model: SkinnedBody) -> FitState:
     if not state.config.stands:
         return state
     soles = ground.soles_of(model)
-    with torch.no_grad():
-        low = ground.sole_heights(state.points.joints, soles, seen.up)
+    low = ground.sole_heights(state.points.joints, soles, seen.up)
     level = low.median() if seen.floor is None else low.new_tensor(seen.floor)
     floor = torch.stack([torch.zeros_like(level), torch.zeros_like(level), level])
     return state.at_values(floor=floor).given(soles=soles)
@@ -165,12 +160,11 @@ def _stages(
     state = state.given(motion=tracks.motion_of(some, speed, config))
     for index, stage in enumerate(stages):
         if state.at.floor.numel():  # the share of the bodies that their legs carry
-            with torch.no_grad():
-                standing = ground.standing_share(state.points.joints, state.plane[0])
+            standing = ground.standing_share(state.points.joints, state.plane[0])
             state = state.given(standing=standing)
         if index == 1 and config.left:
             state = _lowered(state, dataclasses.replace(stage, steps=config.noise_steps), free)
-            off = _pixels(state) - state.seen.pixels
+            off = state.pixels - state.seen.pixels
             noise = noise_of(off, state.seen, state.frame.person, config.left)
             state = state.given(weight=at_most(state.seen, noise, stage.pose))
         state = _laid(_lowered(state, stage, free), some)
@@ -194,19 +188,14 @@ def _lowered(state: FitState, stage: Stage, free: tuple[str, ...]) -> FitState:
     return dataclasses.replace(state, at=unknowns.solve(energy, state.at, stage.steps, free))
 
 
-def _pixels(state: FitState) -> Float[Tensor, "bodies keypoints 2"]:
-    """Where the keypoints of bodies are in the image [px]."""
-    with torch.no_grad():
-        return state.pixels
-
-
 def _bias(state: FitState, noise: Float[Tensor, " bodies"], stage: Stage) -> Bias:
-    """What noise did to shapes and distances."""
+    """What noise did to shapes and distances: as much of it again, always the same."""
     config, person = state.config, state.frame.person
-    pixels = noisy(_pixels(state), noise)
+    drawn = torch.randn(state.pixels.shape, generator=torch.Generator().manual_seed(0))
+    pixels = state.pixels + noise[:, None, None] * drawn.to(noise)
     quick = dataclasses.replace(stage, steps=config.noise_steps)
     again = _lowered(state.given(pixels=pixels), quick, unknowns.EVERYTHING)
-    left = noise_of(_pixels(again) - pixels, state.seen, person, config.left)
+    left = noise_of(again.pixels - pixels, state.seen, person, config.left)
     share = (noise / left.clamp_min(1e-6)).square().clamp_max(1)
     return bias_of(state.at, again.at, person, share)
 
@@ -218,9 +207,7 @@ def _laid(state: FitState, keypoints: Keypoints) -> FitState:
     at, seen = state.at, state.seen
     time = keypoints.frame / keypoints.fps
     rows = rows_by_person(keypoints.frame, keypoints.person)
-    with torch.no_grad():
-        joints = state.points.joints
-    about = ground.distances_of_lying_people(joints, seen.up, rows, time)
+    about = ground.distances_of_lying_people(state.points.joints, seen.up, rows, time)
     free = about.isnan()
     if bool(free.all()):
         return state
@@ -269,5 +256,5 @@ def bodies_of(pose: BodyPose, model: BodyModel, keypoints: Keypoints) -> Bodies:
 def miss_of(state: FitState) -> Float[Tensor, " bodies"]:
     """Root mean square distance of the keypoints that are seen from their projections [px]."""
     there = (state.seen.weight > 0).to(state.seen.pixels)
-    squared = (_pixels(state) - state.seen.pixels).square().sum(-1) * there
+    squared = (state.pixels - state.seen.pixels).square().sum(-1) * there
     return (squared.sum(1) / there.sum(1).clamp_min(1)).sqrt()

@@ -36,8 +36,7 @@ class TrackMotion:
     """Rows of one track at three moments, and how far people leave a straight line there."""
 
     near: Neighbours
-    expected: Float[Tensor, " triples"]
-    """Second difference that people make in that time [m]."""
+    expected: Float[Tensor, " triples"]  #: second difference that people make in that time [m]
     calm: Float[Tensor, "triples joints"]
     """That of each joint, which is less where its picture stands still [m]."""
 
@@ -50,18 +49,13 @@ class Seen:
     weight: Float[Tensor, "bodies keypoints"]
     """Confidence times the weight of the keypoint; 0: missing."""
     K: Float[Tensor, "3 3"]
-    height: int
-    """Of the image [px]."""
-    up: Float[Tensor, "3"]
-    """Away from the floor, in camera axes."""
-    floor: float | None
-    """Height of the floor along `up` from the camera [m]."""
+    height: int  #: of the image [px]
+    up: Float[Tensor, "3"]  #: away from the floor, in camera axes
+    floor: float | None  #: height of the floor along `up` from the camera [m]
     centre: Float[Tensor, "bodies 63"]
     """The pose that the prior expects: of the row's posture, or of the body to start from [rad]."""
-    spread: Float[Tensor, "bodies 63"]
-    """How far from it each angle may be [rad]."""
-    motion: TrackMotion | None = None
-    """None: rows are not neighbours in time."""
+    spread: Float[Tensor, "bodies 63"]  #: how far from it each angle may be [rad]
+    motion: TrackMotion | None = None  #: None: rows are not neighbours in time
     stature: priors.Stature | None = None
     """The prior of their heights; None: the mean shape's, as one more coefficient."""
     lasting: Float[Tensor, " keypoints"] | None = None

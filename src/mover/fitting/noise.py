@@ -57,13 +57,6 @@ def at_most(seen: Seen, noise: Float[Tensor, " bodies"], pose: float) -> Tensor:
     return torch.minimum(seen.weight, most[:, None])
 
 
-def noisy(pixels: Float[Tensor, "bodies keypoints 2"], noise: Float[Tensor, " bodies"]) -> Tensor:
-    """Keypoints with noise [px], always the same."""
-    draw = torch.Generator().manual_seed(0)
-    drawn = torch.randn(pixels.shape, generator=draw).to(pixels)
-    return pixels + noise[:, None, None] * drawn
-
-
 def bias_of(
     found: Unknowns,
     again: Unknowns,

@@ -10,9 +10,7 @@ after Pavlakos et al. 2019 (Sec. 3.3), from the checkpoint of the first version
 reimplemented from its description; no weights are shipped.
 """
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -21,6 +19,7 @@ from torch import Tensor
 from mover.bodies.transfer import solved
 from mover.core.errors import InputError
 from mover.core.observe import Energy
+from mover.core.pickles import load_weights
 from mover.core.records import record
 from mover.fitting.unknowns import ANGLES, PosePrior
 from mover.geometry.rotations import axis_angle
@@ -74,51 +73,31 @@ def load_vposer(path: Path) -> Vposer:
         if not found:
             raise InputError(f"{path}: has no .pt or .ckpt file, expected VPoser's snapshots")
         file = found[-1]
-    if not file.exists():
-        raise InputError(f"{path}: does not exist, expected VPoser's weights")
-    state = _checkpoint(file)
+    state = load_weights(file, "state_dict", "VPoser's weights")
     slope, names = LAYERS[0 if any(LAYERS[0][1][0] in key for key in state) else 1]
-    layers = [_layer(state, name, file) for name in names]
-    _check(layers, file)
-    weights = tuple(weight.float().contiguous() for weight, _ in layers)
-    return Vposer(slope, weights, tuple(bias.float() for _, bias in layers))
+    return _network_of(state, slope, names, file.name)
 
 
-def _checkpoint(file: Path) -> dict[str, Tensor]:
-    """Tensors by name; nothing else in the file is ever run."""
-    try:
-        tree: Any = torch.load(file, map_location="cpu", weights_only=True)
-    except Exception as error:
-        raise InputError(f"{file.name}: cannot be read as plain weights ({error})") from error
-    if isinstance(tree, Mapping) and isinstance(tree.get("state_dict"), Mapping):
-        tree = tree["state_dict"]
-    if not isinstance(tree, Mapping):
-        raise InputError(f"{file.name}: holds a {type(tree).__name__}, expected named weights")
-    return {str(k): v for k, v in tree.items() if isinstance(v, Tensor)}
-
-
-def _layer(state: dict[str, Tensor], name: str, file: Path) -> tuple[Tensor, Tensor]:
-    """Weight and bias of a layer, whatever its prefix."""
+def _network_of(
+    state: dict[str, Tensor], slope: float, names: tuple[str, ...], file: str
+) -> Vposer:
+    """Three layers, whatever the prefix of their names, that fit each other and end in a body."""
     found: list[Tensor] = []
-    for part in ("weight", "bias"):
-        keys = [key for key in state if key.endswith(f"{name}.{part}")]
+    for name in (f"{layer}.{part}" for layer in names for part in ("weight", "bias")):
+        keys = [key for key in state if key.endswith(name)]
         if len(keys) != 1:
             some = ", ".join(sorted(state)[:8]) or "nothing"
-            raise InputError(f"{file.name}: has no '{name}.{part}', found {some} ...")
-        found.append(state[keys[0]])
-    return found[0], found[1]
-
-
-def _check(layers: list[tuple[Tensor, Tensor]], file: Path) -> None:
-    """Three layers that fit each other and end in six numbers for at least 21 joints."""
-    shapes = [(tuple(w.shape), tuple(b.shape)) for w, b in layers]
-    fits = len(layers) == 3 and all(w.ndim == 2 and b.shape == w.shape[:1] for w, b in layers)
-    if fits:
-        (a, _), (b, _), (c, _) = layers
-        fits = len(a) == b.shape[1] and len(b) == c.shape[1] and len(c) >= 6 * BODY_JOINTS
-    if not fits:
+            raise InputError(f"{file}: has no '{name}', found {some} ...")
+        found.append(state[keys[0]].contiguous())
+    layers = list(zip(found[::2], found[1::2], strict=True))
+    (a, _), (b, _), (c, _) = layers
+    fits = all(weight.ndim == 2 and bias.shape == weight.shape[:1] for weight, bias in layers)
+    joined = fits and len(a) == b.shape[1] and len(b) == c.shape[1]
+    if not joined or len(c) < 6 * BODY_JOINTS:
+        shapes = [(tuple(weight.shape), tuple(bias.shape)) for weight, bias in layers]
         expected = f"3 layers that end in 6 numbers for {BODY_JOINTS} joints or more"
-        raise InputError(f"{file.name}: has layers {shapes}, expected {expected}")
+        raise InputError(f"{file}: has layers {shapes}, expected {expected}")
+    return Vposer(slope, tuple(found[::2]), tuple(found[1::2]))
 
 
 def decoded(network: Vposer, code: Float[Tensor, "bodies code"]) -> Float[Tensor, "bodies 21 3 3"]:
@@ -161,9 +140,5 @@ def vposer_prior(network: Vposer) -> PosePrior:
 
 
 def prior_of(weights: Path | None) -> PosePrior:
-    """VPoser's prior from its weights; None: no learned prior.
-
-    Raises:
-        InputError: If they cannot be used.
-    """
+    """VPoser's prior from its weights; None: no learned prior."""
     return ANGLES if weights is None else vposer_prior(load_vposer(weights))

@@ -126,12 +126,9 @@ BONES = 4.6  # [m], the 21 bones of a usual person end to end
 class Stature:
     """Stature as a linear function of the shape coefficients, and the given heights."""
 
-    usual: float
-    """Height of the mean shape [m]."""
-    dirs: Float[Tensor, " shape"]
-    """What each number of the shape adds to it [m]."""
-    given: Float[Tensor, " people"]
-    """Height of each person [m]; NaN: unknown."""
+    usual: float  #: height of the mean shape [m]
+    dirs: Float[Tensor, " shape"]  #: what each number of the shape adds to it [m]
+    given: Float[Tensor, " people"]  #: height of each person [m]; NaN: unknown
 
     def heights(self, betas: Float[Tensor, "people shape"]) -> Float[Tensor, " people"]:
         """Height of each person [m]."""

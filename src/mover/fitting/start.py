@@ -75,24 +75,18 @@ class FitStart:
 
     at: Unknowns
     root: Float[Tensor, "bodies 3 3"]
-    centre: Float[Tensor, "bodies 63"]
-    """The pose that is expected [rad]."""
-    spread: Float[Tensor, "bodies 63"]
-    """How far from it each angle may be [rad]."""
+    centre: Float[Tensor, "bodies 63"]  #: the pose that is expected [rad]
+    spread: Float[Tensor, "bodies 63"]  #: how far from it each angle may be [rad]
 
 
 @record
 class Guess:
     """A hypothesis that is tried for every row."""
 
-    pose: Float[Tensor, "63"]
-    """Angles of the body [rad]."""
-    spread: Float[Tensor, "63"]
-    """How far from them each may be [rad]."""
-    root: Float[Tensor, "3 3"]
-    """The root's rotation in the world."""
-    upright: bool
-    """Tilted in the image as the trunk is seen there."""
+    pose: Float[Tensor, "63"]  #: angles of the body [rad]
+    spread: Float[Tensor, "63"]  #: how far from them each may be [rad]
+    root: Float[Tensor, "3 3"]  #: the root's rotation in the world
+    upright: bool  #: tilted in the image as the trunk is seen there
 
 
 @record
@@ -100,8 +94,7 @@ class Tried(FitStart):
     """A hypothesis that was fitted to rows."""
 
     cost: Float[Tensor, " bodies"]
-    joints: Float[Tensor, "bodies joints 3"]
-    """Of the body, in camera axes [m]."""
+    joints: Float[Tensor, "bodies joints 3"]  #: of the body, in camera axes [m]
 
 
 def upright_guesses(like: Tensor) -> list[Guess]:
@@ -247,9 +240,8 @@ def _tried(guess: Guess, seen: Seen, R: Float[Tensor, "3 3"], rig: Rig, config: 
         return dataclasses.replace(state, at=u).energy(START)
 
     at = solve(energy, state.at, config.start_steps, ("turn", "code", "place"))
-    with torch.no_grad():
-        cost = energy(at).per_item / START.pose**2 - narrow
-        joints = points_of(at, frame).joints[:, :22]
+    cost = energy(at).per_item / START.pose**2 - narrow
+    joints = points_of(at, frame).joints[:, :22]
     if not guess.upright:
         slope = (trunk_of(joints) @ seen.up).clamp(-1, 1).asin()
         cost = cost + robust_square(slope.square(), SLOPE) / LEVEL**2
@@ -310,10 +302,7 @@ def start_rows(
 ) -> Int[Tensor, " rows"]:
     """The row of `start` for each row of the keypoints: the same person, the nearest frame.
 
-    People are paired by where they are in the image.
-
-    Raises:
-        InputError: If a person of the keypoints has no body.
+    People are paired by where they are in the image; each has to have a body.
     """
     from scipy.optimize import linear_sum_assignment
 

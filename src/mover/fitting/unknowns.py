@@ -33,8 +33,7 @@ class Rig:
     """Share of each joint, then of each vertex, in each keypoint."""
     keypoints: Int[Tensor, " keypoints"]
     """Index of the keypoints in their layout: those that are used and that the model has."""
-    names: tuple[str, ...]
-    """Of these keypoints."""
+    names: tuple[str, ...]  #: of these keypoints
     bones: Int[Tensor, " keypoints"]
     """The joint whose rotation carries each keypoint: of a joint, its parent."""
 
@@ -48,11 +47,7 @@ class Points:
 
 
 def rig_of(model: SkinnedBody, layout: str, used: Bool[Tensor, " layout"]) -> Rig:
-    """The rig of the keypoints of a layout that are `used`.
-
-    Raises:
-        ValueError: If there is no such layout.
-    """
+    """The rig of the keypoints of a layout that are `used`."""
     spots = spots_of(model, layout)
     index = torch.nonzero(used.cpu() & spots.there)[:, 0]
     names = tuple(LAYOUTS[layout][k] for k in index.tolist())
@@ -79,32 +74,6 @@ def rig_of(model: SkinnedBody, layout: str, used: Bool[Tensor, " layout"]) -> Ri
     return Rig(small, mix, index, names, bones)
 
 
-def move(
-    rig: Rig,
-    turns: Float[Tensor, "bodies joints 3 3"],
-    betas: Float[Tensor, "bodies shape"],
-    pelvis: Float[Tensor, "bodies 3"],
-    expression: Float[Tensor, "bodies expression"] | None = None,
-    lasting: Float[Tensor, "bodies keypoints 3"] | None = None,
-) -> Points:
-    """Keypoints and joints of bodies whose pelvis is at a position [m], differentiable in all.
-
-    `lasting` moves each keypoint in the axes of its bone [m].
-    """
-    verts, joints = rig.model.rest(turns, betas, expression)
-    world, places = pose_joints(rig.model, turns, joints)
-    offset = places - (world @ joints[..., None])[..., 0]
-    moves = torch.cat([world, offset[..., None]], -1).flatten(2)
-    skin = (rig.model.weights.to(moves) @ moves).unflatten(-1, (3, 4))
-    moved = (skin[..., :3] @ verts[..., None])[..., 0] + skin[..., 3]
-    shift = (pelvis - places[:, 0])[:, None]
-    both = torch.cat([places, moved], 1)
-    keypoints = rig.mix.to(both) @ both + shift
-    if lasting is not None:
-        keypoints = keypoints + (world[:, rig.bones] @ lasting[..., None])[..., 0]
-    return Points(keypoints, places + shift)
-
-
 HAND = 45
 NO_FLOOR = torch.zeros(0)
 NO_OFFSETS = torch.zeros(0, 0, 3)
@@ -114,8 +83,7 @@ NO_OFFSETS = torch.zeros(0, 0, 3)
 class Unknowns:
     """One row a body, one shape a person."""
 
-    turn: Float[Tensor, "bodies 3"]
-    """Turns the root's first guess, in camera axes [rad]."""
+    turn: Float[Tensor, "bodies 3"]  #: turns the root's first guess, in camera axes [rad]
     code: Float[Tensor, "bodies code"]
     """The pose of the body: its angles [rad], or the code of a learned prior."""
     place: Float[Tensor, "bodies 3"]
@@ -160,10 +128,8 @@ class Frame:
     """What turns unknowns into a body, and is not solved."""
 
     rig: Rig
-    root: Float[Tensor, "bodies 3 3"]
-    """First guess of the root's rotation, in camera axes."""
-    person: Int[Tensor, " bodies"]
-    """Row of `betas`."""
+    root: Float[Tensor, "bodies 3 3"]  #: first guess of the root's rotation, in camera axes
+    person: Int[Tensor, " bodies"]  #: row of `betas`
     growth: Float[Tensor, " shape"] | None = None
     """What each number of the shape adds to the logarithm of the depth: a taller person farther
     away looks the same, so that shapes alone would hardly move. None: nothing."""
@@ -200,11 +166,22 @@ def place_of(pelvis: Float[Tensor, "bodies 3"]) -> Float[Tensor, "bodies 3"]:
 
 
 def points_of(at: Unknowns, frame: Frame) -> Points:
-    """Keypoints and joints of the bodies, in camera axes [m]."""
+    """Keypoints and joints of the bodies, in camera axes [m], differentiable in the unknowns."""
+    rig, turns = frame.rig, turns_of(at, frame)
     expression = at.face[:, 3:] if at.face.shape[1] > 3 else None
-    turns = turns_of(at, frame)
-    lasting = at.offset[frame.person] if at.offset.shape[1] else None
-    return move(frame.rig, turns, at.betas[frame.person], pelvis_of(at, frame), expression, lasting)
+    verts, joints = rig.model.rest(turns, at.betas[frame.person], expression)
+    world, places = pose_joints(rig.model, turns, joints)
+    offset = places - (world @ joints[..., None])[..., 0]
+    moves = torch.cat([world, offset[..., None]], -1).flatten(2)
+    skin = (rig.model.weights.to(moves) @ moves).unflatten(-1, (3, 4))
+    moved = (skin[..., :3] @ verts[..., None])[..., 0] + skin[..., 3]
+    shift = (pelvis_of(at, frame) - places[:, 0])[:, None]
+    both = torch.cat([places, moved], 1)
+    keypoints = rig.mix.to(both) @ both + shift
+    if at.offset.shape[1]:
+        lasting = at.offset[frame.person]
+        keypoints = keypoints + (world[:, rig.bones] @ lasting[..., None])[..., 0]
+    return Points(keypoints, places + shift)
 
 
 def turns_of(at: Unknowns, frame: Frame) -> Float[Tensor, "bodies joints 3 3"]:
@@ -245,11 +222,7 @@ def solve(
     steps: int,
     free: tuple[str, ...] = EVERYTHING,
 ) -> Unknowns:
-    """Lower the energy in the fields `free`.
-
-    Raises:
-        ValueError: If the energy is not finite at the start.
-    """
+    """Lower the energy in the fields `free`; see `solved`."""
     scale = {
         name: torch.tensor(
             BENDS if name == "code" and at.shape[-1] == len(BENDS) else SCALES[name],

@@ -43,7 +43,8 @@ def beyond(of: Box, points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 2"]:
 
 def iou3d(a: Box, b: Box) -> Float[Tensor, "*b"]:
     """Shared volume over joint volume of upright boxes; 0 where both are empty."""
-    overlap = torch.minimum(_top(a), _top(b)) - torch.maximum(_bottom(a), _bottom(b))
+    (low, high), (bottom, top) = _ends(a), _ends(b)
+    overlap = torch.minimum(high, top) - torch.maximum(low, bottom)
     shared = _shared_footprint(a, b) * overlap.clamp_min(0)
     joint = a.size.double().prod(-1) + b.size.double().prod(-1) - shared
     return (shared / joint.clamp_min(torch.finfo(torch.float64).tiny)).to(a.size.dtype)
@@ -61,12 +62,10 @@ def _area(box: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b"]:
     return (box[..., 2:] - box[..., :2]).clamp_min(0).prod(-1)
 
 
-def _top(box: Box) -> Float[Tensor, "*b"]:
-    return box.center[..., 1].double() + box.size[..., 1].double() / 2
-
-
-def _bottom(box: Box) -> Float[Tensor, "*b"]:
-    return box.center[..., 1].double() - box.size[..., 1].double() / 2
+def _ends(box: Box) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b"]]:
+    """Lowest and highest y [m]."""
+    middle, half = box.center[..., 1].double(), box.size[..., 1].double() / 2
+    return middle - half, middle + half
 
 
 def _shared_footprint(a: Box, b: Box) -> Float[Tensor, "*b"]:
@@ -105,15 +104,9 @@ def _clipped(
     limit = limit[..., None]
     crosses = (here > limit) != (there > limit)
     share = torch.where(crosses, (limit - here) / torch.where(crosses, there - here, 1.0), 0.0)
-    start = _onto(polygon, axis, side * torch.minimum(here, limit))
+    along = torch.arange(2, device=polygon.device) == axis
+    start = torch.where(along, side * torch.minimum(here, limit)[..., None], polygon)
     middle = polygon + share[..., None] * (following - polygon)
-    middle = _onto(middle, axis, side * torch.minimum(side * middle[..., axis], limit))
+    held = side * torch.minimum(side * middle[..., axis], limit)
+    middle = torch.where(along, held[..., None], middle)
     return torch.stack([start, middle], -2).flatten(-3, -2)
-
-
-def _onto(
-    points: Float[Tensor, "*b n 2"], axis: int, value: Float[Tensor, "*b n"]
-) -> Float[Tensor, "*b n 2"]:
-    pair = [points[..., 0], points[..., 1]]
-    pair[axis] = value
-    return torch.stack(pair, -1)

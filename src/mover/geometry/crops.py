@@ -5,6 +5,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mover.geometry.camera import at_pixels
 from mover.geometry.raster import Crops
 
 
@@ -61,14 +62,9 @@ def sample_nearest(
 ) -> Float[Tensor, "items wh ww"]:
     """Value of an image with intrinsics `K` at the centre of each window pixel."""
     x, y = grid_in_image(views, K)
-    columns = ((x[:, 1:] + x[:, :-1]) / 2).floor().long()
-    rows = ((y[:, 1:] + y[:, :-1]) / 2).floor().long()
-    height, width = image.shape
-    inside = ((columns >= 0) & (columns < width)).unsqueeze(-2)
-    inside = inside & ((rows >= 0) & (rows < height)).unsqueeze(-1)
-    picked = image[
-        rows.clamp(0, height - 1).unsqueeze(-1), columns.clamp(0, width - 1).unsqueeze(-2)
-    ]
+    columns, rows = (((line[:, 1:] + line[:, :-1]) / 2).floor().long() for line in (x, y))
+    pixels = torch.stack(torch.broadcast_tensors(columns[:, None], rows[:, :, None]), -1)
+    picked, inside = at_pixels(image, pixels)
     return torch.where(inside, picked, torch.full_like(picked, outside))
 
 

@@ -79,19 +79,15 @@ def vertex_normals(
     verts: Float[Tensor, "*b verts 3"], faces: Int[Tensor, "faces 3"]
 ) -> Float[Tensor, "*b verts 3"]:
     """Unit normals at the vertices: of their faces, weighted by area; zero where there are none."""
-    meshes = verts.reshape(-1, *verts.shape[-2:]).split(AT_ONCE)
-    rows = [_vertex_normals(some.movedim(-2, 0), faces).movedim(0, -2) for some in meshes]
+    rows: list[Tensor] = []
+    for some in verts.reshape(-1, *verts.shape[-2:]).split(AT_ONCE):
+        flat = some.movedim(-2, 0).reshape(some.shape[-2], -1)
+        a, b, c = (flat.index_select(0, k).reshape(len(k), -1, 3) for k in faces.unbind(-1))
+        vectors = torch.linalg.cross(b - a, c - a).reshape(len(faces), -1).repeat_interleave(3, 0)
+        total = torch.zeros_like(flat).index_add(0, faces.reshape(-1), vectors)
+        found = torch.nn.functional.normalize(total.unflatten(-1, (-1, 3)), dim=-1)
+        rows.append(found.movedim(0, -2))
     return torch.cat(rows).reshape(verts.shape) if rows else verts.clone()
-
-
-def _vertex_normals(
-    verts: Float[Tensor, "verts meshes 3"], faces: Int[Tensor, "faces 3"]
-) -> Float[Tensor, "verts meshes 3"]:
-    flat = verts.reshape(len(verts), -1)
-    a, b, c = (flat.index_select(0, k).reshape(len(k), -1, 3) for k in faces.unbind(-1))
-    vectors = torch.linalg.cross(b - a, c - a).reshape(len(faces), -1).repeat_interleave(3, 0)
-    total = torch.zeros_like(flat).index_add(0, faces.reshape(-1), vectors)
-    return torch.nn.functional.normalize(total.reshape(verts.shape), dim=-1)
 
 
 def _area_vectors(
@@ -143,7 +139,11 @@ def decimate(mesh: Mesh, faces: int) -> Mesh:
     if faces >= len(mesh.faces):
         return mesh
     target, closed = float(faces), is_closed(mesh.faces)
-    outer = _outer(mesh) if closed else used(mesh)
+    keep = torch.ones(len(mesh.faces), dtype=torch.bool)
+    if closed:  # without the hollows in a solid, which no simplification keeps
+        part_of, parts = volumes(as_float64(mesh.verts), as_int64(mesh.faces))
+        keep = torch.from_numpy((np.sign(signed_volume(mesh)) * parts > 0)[part_of])
+    outer = used(Mesh(mesh.verts, mesh.faces[keep]))
     while target < len(mesh.faces):
         whole = _simplified(mesh, int(target))
         small = _resolidified(whole, mesh) if closed else whole
@@ -151,13 +151,6 @@ def decimate(mesh: Mesh, faces: int) -> Mesh:
             return fit_box(small, *box(used(mesh).verts))
         target *= GENTLER
     return mesh
-
-
-def _outer(mesh: Mesh) -> Mesh:
-    """A solid without the hollows in it, which no simplification keeps."""
-    part_of, parts = volumes(as_float64(mesh.verts), as_int64(mesh.faces))
-    keep = np.sign(signed_volume(mesh)) * parts > 0
-    return used(Mesh(mesh.verts, mesh.faces[torch.from_numpy(keep[part_of])]))
 
 
 def _strays(mesh: Mesh, whole: Mesh, small: Mesh) -> float:

@@ -10,7 +10,6 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -19,7 +18,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate, max_pool3d, pad
 
 from mover.core.errors import InputError
-from mover.core.settings import float_in, int_in
+from mover.core.pickles import load_weights
 from mover.core.types import Mesh
 from mover.geometry.mesh import box, fit_box, sample_surface, used
 from mover.geometry.topology import level_set
@@ -91,23 +90,13 @@ def load_occupancy(path: Path) -> OccupancyNetwork:
         InputError: If the file is missing, is no checkpoint of a point-cloud network, or keys are
             missing, unknown, or of another shape.
     """
-    name = path.name
-    if not path.is_file():
-        raise InputError(f"{path}: there is no such file, expected an Occupancy Network")
-    try:
-        tree: Any = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises what the damage happens to cause
-        text = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
-        raise InputError(f"{name}: cannot be read ({text}), expected a checkpoint") from error
-    state: Any = tree.get("model", tree) if isinstance(tree, dict) else None
-    if not isinstance(state, dict) or not all(isinstance(v, Tensor) for v in state.values()):
-        raise InputError(f"{name}: holds no parameters, expected the field 'model' of a checkpoint")
+    state = load_weights(path, "model", "an Occupancy Network")
     try:
         return network_of(state)
     except (KeyError, ValueError, RuntimeError, IndexError) as error:
         text = str(error).splitlines()[0][:120]
         raise InputError(
-            f"{name}: is not an Occupancy Network for point clouds ({text}), expected "
+            f"{path.name}: is not an Occupancy Network for point clouds ({text}), expected "
             "pointnet_resnet and cbatchnorm, as in onet_pcl2mesh"
         ) from error
 
@@ -118,7 +107,7 @@ def network_of(state: dict[str, Tensor]) -> OccupancyNetwork:
     Raises:
         KeyError, ValueError, RuntimeError, IndexError: If it is another network's.
     """
-    state = {key.removeprefix("module."): value.float() for key, value in state.items()}
+    state = {key.removeprefix("module."): value for key, value in state.items()}
     state = {key: value for key, value in state.items() if not IGNORED.search(key)}
     unknown = [key for key in state if not KEYS.fullmatch(key)]
     if unknown:
@@ -128,26 +117,20 @@ def network_of(state: dict[str, Tensor]) -> OccupancyNetwork:
     return network
 
 
-@dataclass(frozen=True)
-class ExtractConfig:
-    """How finely the surface is searched: as MOVER runs it."""
-
-    coarse: Annotated[int, int_in(2, 1024)] = 32
-    """Cells along a side at first."""
-    levels: Annotated[int, int_in(0, 8)] = 2
-    """How often cells are halved near the surface."""
-    threshold: Annotated[float, float_in(1e-6, 1 - 1e-6)] = 0.2
-    """Probability of the surface."""
+COARSE, LEVELS = 32, 2  # cells along a side at first; how often they are halved near the surface
+THRESHOLD = 0.2  # probability of the surface; all three as MOVER runs it
 
 
-def extract(inside: Inside, config: ExtractConfig) -> Mesh:
+def extract(
+    inside: Inside, *, coarse: int = COARSE, levels: int = LEVELS, threshold: float = THRESHOLD
+) -> Mesh:
     """The surface of logits in the unit cube, found cell by cell where they change sign.
 
     Raises:
         ValueError: If nothing is inside.
     """
-    limit = float(np.log(config.threshold) - np.log1p(-config.threshold))
-    field = refined(lambda p: inside(p) - limit, config)
+    limit = float(np.log(threshold) - np.log1p(-threshold))
+    field = refined(lambda p: inside(p) - limit, coarse, levels)
     if not bool((field > 0).any()):
         raise ValueError("extract: nothing is inside")
     padded = pad(field, (1,) * 6, value=OUTSIDE).double().numpy()
@@ -156,7 +139,7 @@ def extract(inside: Inside, config: ExtractConfig) -> Mesh:
     return Mesh(torch.from_numpy(verts).float(), torch.from_numpy(faces))
 
 
-def refined(field: Inside, config: ExtractConfig) -> Float[Tensor, "n n n"]:
+def refined(field: Inside, coarse: int, levels: int) -> Float[Tensor, "n n n"]:
     """Values on the finest grid; away from the surface they are interpolated from coarser ones.
 
     Cells whose corners differ in sign are halved. Where a new value changes the sign of a cell that
@@ -168,10 +151,10 @@ def refined(field: Inside, config: ExtractConfig) -> Float[Tensor, "n n n"]:
         points = index.float() * (PADDING / cells) - PADDING / 2
         return torch.cat([field(part) for part in points.split(AT_ONCE)])
 
-    cells, axis = config.coarse, torch.arange(config.coarse + 1)
+    cells, axis = coarse, torch.arange(coarse + 1)
     values = evaluated(torch.cartesian_prod(axis, axis, axis), cells)
     values = values.reshape(cells + 1, cells + 1, cells + 1)
-    for _ in range(config.levels):
+    for _ in range(levels):
         split = _mixed(values)
         for dim in range(3):
             split = split.repeat_interleave(2, dim)
@@ -201,9 +184,7 @@ def _corners(cells: Bool[Tensor, "m m m"]) -> Bool[Tensor, "n n n"]:
     return max_pool3d(pad(cells[None, None].float(), (1,) * 6), 2, stride=1)[0, 0] > 0
 
 
-def occupied_mesh(
-    network: OccupancyNetwork, mesh: Mesh, config: ExtractConfig | None = None
-) -> Mesh:
+def occupied_mesh(network: OccupancyNetwork, mesh: Mesh) -> Mesh:
     """What the network makes of a mesh: closed, in the same box.
 
     It sees even points of the surface in the axes and the size of its training data (ShapeNet's:
@@ -219,6 +200,6 @@ def occupied_mesh(
     cloud = ((points - middle) / longest).float().flip(-1)
     with torch.no_grad():
         code = network.encode(cloud[None])
-        found = extract(lambda p: network.decode(p[None], code)[0], config or ExtractConfig())
+        found = extract(lambda p: network.decode(p[None], code)[0])
     verts, faces = found.verts.flip(-1), found.faces.flip(-1)  # the change of axes is a mirror
     return fit_box(Mesh(verts.to(mesh.verts), faces), low, high)

@@ -73,11 +73,7 @@ def _outlines(inside: np.ndarray, cell: float) -> np.ndarray:
         section = np.ascontiguousarray(inside[:, height])
         key = section.tobytes()
         if key not in known:
-            known[key] = _outline(section) * cell
+            within, beyond = 0.5 - depth_in(section), depth_in(~section).clip(max=1.5) - 0.5
+            known[key] = np.where(section, within, beyond) * cell
         found[:, height] = known[key]
     return found
-
-
-def _outline(section: np.ndarray) -> np.ndarray:
-    """Signed distance to the border between cells [cells]."""
-    return np.where(section, 0.5 - depth_in(section), depth_in(~section).clip(max=1.5) - 0.5)

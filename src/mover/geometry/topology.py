@@ -33,8 +33,15 @@ def solid(verts: np.ndarray, faces: np.ndarray) -> Triangles | None:
             return None
         parts.extend(found)
     parts = _without_sheets(parts, SHEET_SHARE * surface)
-    whole = parts[0] if len(parts) == 1 else _united(parts)
-    return whole if whole is not None and is_closed(torch.from_numpy(whole[1])) else None
+    if len(parts) != 1:
+        import manifold3d
+
+        solids = [_as_solid(*part) for part in parts]
+        if not solids or any(one.is_empty() for one in solids):
+            return None
+        union = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add)
+        parts = [_as_triangles(union)]
+    return parts[0] if is_closed(torch.from_numpy(parts[0][1])) else None
 
 
 def areas(corners: np.ndarray) -> np.ndarray:
@@ -137,15 +144,6 @@ def _holes(faces: np.ndarray, count: int) -> list[np.ndarray]:
         if vertex == start:
             holes.append(np.array(loop))
     return holes
-
-
-def _united(parts: list[Triangles]) -> Triangles | None:
-    import manifold3d
-
-    solids = [_as_solid(*part) for part in parts]
-    if not solids or any(one.is_empty() for one in solids):
-        return None
-    return _as_triangles(manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add))
 
 
 def _as_solid(verts: np.ndarray, faces: np.ndarray) -> Any:  # noqa: ANN401

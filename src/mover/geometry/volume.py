@@ -25,7 +25,7 @@ from torch.autograd.function import once_differentiable
 
 from mover.core.records import record
 from mover.geometry.nearest import as_float64, as_int64, closest, enclosed
-from mover.geometry.warp_start import array, filled, kernels, launch, name_of, started
+from mover.geometry.warp_start import filled, kernels, launch, name_of, started
 
 SHELL = 2.0  # [cells], up to where it is exact outside: more than a cell's diagonal
 BAND = 4.0  # [cells], what stands for any larger distance
@@ -185,14 +185,14 @@ def winding(verts: np.ndarray, faces: np.ndarray, shape: np.ndarray) -> np.ndarr
     """
     from mover.geometry.kernels.bodies import Body
 
-    wp, size, cross = started(), [int(n) for n in shape], kernels("bodies", "cpu").cross
-    body, steps = Body(), np.zeros((size[0], size[2], size[1] + 1), dtype=np.int32)
-    body.size = wp.vec3i(*size)
-    body.faces = wp.array(faces.astype(np.int32), dtype=wp.vec3i, device="cpu")
-    body.place = wp.array(verts, dtype=wp.vec3d, device="cpu")
-    body.winding = wp.array(steps, dtype=wp.int32, device="cpu", copy=False)
-    wp.launch(cross, len(faces), [body], device="cpu")
-    return steps[..., :-1].cumsum(2, dtype=np.int32).swapaxes(1, 2)
+    cross, (x, y, z) = kernels("bodies", "cpu").cross, shape.tolist()
+    steps = torch.zeros(x, z, y + 1, dtype=torch.int32)
+    body = filled(
+        Body, faces=torch.from_numpy(faces.astype(np.int32)), place=torch.from_numpy(verts),
+        size=started().vec3i(x, y, z), winding=steps,
+    )  # fmt: skip
+    launch(cross, len(faces), [body], steps.device)
+    return steps[..., :-1].cumsum(2, dtype=torch.int32).transpose(1, 2).numpy()
 
 
 def union_bodies(
@@ -245,7 +245,8 @@ def _mesh(verts: Tensor, corners: Tensor) -> Any:  # noqa: ANN401
     square = torch.linalg.cross(b - a, c - a).square().sum(-1)
     flat = square <= SLIVER**2 * (b - a).square().sum(-1) * (c - a).square().sum(-1)
     some = corners if bool(flat.all()) else corners[~flat]
-    return started().Mesh(array(verts.clone(), "vec3"), array(some.flatten(), "int32"))
+    wp = started()
+    return wp.Mesh(wp.from_torch(verts.clone(), dtype=wp.vec3), wp.from_torch(some.flatten()))
 
 
 def add_body(
@@ -269,17 +270,14 @@ def add_body(
     side = 1 if float((torch.linalg.cross(a, b) * c).sum()) >= 0 else -1
     size = (high - low + 1).tolist()
     shape = size[0], size[2], size[1]
-    body = bodies.Body()
-    body.faces, body.place = array(corners, "vec3i"), array(place, "vec3d")
-    body.low, body.size = wp.vec3i(*low.tolist()), wp.vec3i(*size)
-    steps = torch.zeros(*shape[:2], shape[2] + 1, dtype=torch.int32, device=device)
-    body.winding = array(steps, "int32")
-    near = torch.full(shape, bodies.FAR, device=device)
-    body.near = array(near, "float32")
-    at = place.float()
-    wp.copy(mesh.points, array(at, "vec3"))
+    body = filled(
+        bodies.Body, faces=corners, place=place, low=wp.vec3i(*low.tolist()), size=wp.vec3i(*size),
+        winding=torch.zeros(*shape[:2], shape[2] + 1, dtype=torch.int32, device=device),
+        near=torch.full(shape, bodies.FAR, device=device),
+    )  # fmt: skip
+    wp.copy(mesh.points, wp.from_torch(place.float(), dtype=wp.vec3))
     mesh.refit()
-    field = array(volume.values, "float32")
+    field = wp.from_torch(volume.values)
     launch(bodies.cross, len(corners), [body], device)
     launch(bodies.surround, len(corners), [body], device)
     launch(bodies.lower, shape[:2], [body, mesh.id, side, field, volume.cell], device)

@@ -111,12 +111,6 @@ def _quiet(wp: ModuleType) -> Generator[None, None, None]:
         wp.config.log_level = level
 
 
-def array(tensor: Tensor, dtype: str) -> Any:  # noqa: ANN401
-    """The tensor's memory as an array of Warp."""
-    wp = started()
-    return wp.from_torch(tensor.detach(), dtype=getattr(wp, dtype))
-
-
 def filled(kind: Any, **fields: Any) -> Any:  # noqa: ANN401
     """A struct of the kernels; tensors become arrays of the declared kind without a copy."""
     made = kind()

@@ -4,7 +4,9 @@ An evaluation gives the terms and their gradient at once. Items, the starts of a
 nothing, so that the result does not depend on the number of threads.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from threading import Lock
 from typing import Any
 
@@ -20,7 +22,7 @@ from mover.energy.objective import SCENE_TERMS, HumanCues, ImageCues, SceneEvide
 from mover.geometry.raster.draw import scratch_of
 from mover.geometry.raster.draw import windows as lens_of
 from mover.geometry.volume import field_of
-from mover.geometry.warp_start import array, filled, kernels, share, started, threads
+from mover.geometry.warp_start import filled, kernels, share, started, threads
 
 KERNELS = "mover.energy.fused.kernels"
 BORDER = 1  # [px], as in the rasterisers
@@ -34,24 +36,12 @@ SLOPES = 9
 FIRST = 3  # position of the first item among the arguments of the kernel
 
 
-@dataclass(frozen=True)
-class BufferSize:
-    """What one item needs at most."""
-
-    verts: int
-    faces: int
-    edges: int
-    height: int  #: rows of a grid, with the border [px]
-    width: int  #: columns of a grid, with the border [px]
-    shifts: int = 1  #: how many borders each mask may have
-
-
 @dataclass
 class FusedEnergy:
     """The kernel and its memory, for layouts of one evidence; it is used by one at a time."""
 
     data: Any  #: `kernels.data.KernelInput`
-    size: BufferSize
+    workspace: Callable[[], Any]  #: new `kernels.data.Workspace`, one for each thread
     effort: Tensor  #: how much work each object is, roughly
     camera: Tensor  #: from the world to the camera, where nothing else is asked for
     turn: Tensor  #: the same as it is now; memory of the kernel
@@ -183,46 +173,43 @@ def _buffers_of(fused: FusedEnergy, items: int, count: int) -> _Buffers:
     from mover.energy.fused.kernels.data import ItemCosts
 
     kernel, launch = kernels("cost", "cpu", KERNELS).cost_items, started().launch
-    layout, whole = torch.empty(items, UNKNOWNS), torch.empty(items)
-    parts, slope = torch.empty(items, TERMS), torch.empty(items, SLOPES)
-    slopes = torch.empty(items, TERMS, SLOPES)
-    order = torch.zeros(items, dtype=torch.int32)
-    answer = filled(
-        ItemCosts, order=order, layout=layout, parts=parts, slopes=slopes, whole=whole, slope=slope
-    )
-    inputs = [[fused.data, _workspace(fused.size), answer, 0, 0] for _ in range(count)]
+    memory = {
+        "order": torch.zeros(items, dtype=torch.int32), "layout": torch.empty(items, UNKNOWNS),
+        "parts": torch.empty(items, TERMS), "slopes": torch.empty(items, TERMS, SLOPES),
+        "whole": torch.empty(items), "slope": torch.empty(items, SLOPES),
+    }  # fmt: skip
+    answer = filled(ItemCosts, **memory)
+    inputs = [[fused.data, fused.workspace(), answer, 0, 0] for _ in range(count)]
     launches = tuple(launch(kernel, 1, row, device="cpu", record_cmd=True) for row in inputs)
-    none = torch.zeros(0, dtype=torch.long)
-    return _Buffers(none, order, layout, parts, slopes, whole, slope, launches)
+    return _Buffers(**memory, rows=torch.zeros(0, dtype=torch.long), launches=launches)
 
 
-def _workspace(size: BufferSize) -> Any:  # noqa: ANN401
-    """`kernels.data.Workspace` of a thread."""
+def _workspace(verts: int, faces: int, edges: int, size: tuple[int, int], shifts: int) -> Any:  # noqa: ANN401
+    """`kernels.data.Workspace` of a thread, for items of at most so many parts.
+
+    The size is height and width of a grid, with the border [px]; `shifts` is how many borders each
+    mask may have.
+    """
     from mover.energy.fused.kernels.data import Workspace
     from mover.geometry.kernels.scene import Items
 
-    grid = size.height * size.width
-    space, scene = Workspace(), Items()
-    scene.verts = array(torch.zeros(size.verts, 3), "vec3")
-    scene.window = array(torch.zeros(1, 4), "vec4")
-    scene.views = scene.shapes = 1
-    scene.n_verts, scene.n_faces, scene.n_edges = size.verts, size.faces, size.edges
-    scene.height, scene.width, scene.border = size.height, size.width, BORDER
-    sizes = size.verts, size.faces, size.edges, grid, 2 * grid
-    space.scene, space.scratch = scene, scratch_of(sizes)
-    # What is covered: two arrays are one memory, seen by bytes and by words.
-    space.stride, space.across = (size.width // 8 + 1) * 8, -(-size.width // 64)
-    words = torch.zeros(size.height * space.stride // 8, dtype=torch.int64)
-    space.words, space.steps = array(words, "uint64"), array(words.view(torch.uint8), "uint8")
-    bits = torch.zeros(2, size.height * space.across, dtype=torch.int64)
-    space.seen, space.behind = (array(b, "uint64") for b in bits)
-    space.pairs = array(torch.empty(2 * grid, dtype=torch.int32), "int32")
-    space.keys = array(torch.empty(2 * grid, dtype=torch.int64), "uint64")
-    space.crossings = array(torch.empty(2 * grid, 4), "vec4")
-    space.shift = array(torch.zeros(grid), "float32")
-    space.moved = array(torch.zeros(2 * grid), "float32")
-    space.squares = array(torch.zeros(size.shifts, dtype=torch.float64), "float64")
-    return space
+    height, width = size
+    grid, stride, across = height * width, (width // 8 + 1) * 8, -(-width // 64)
+    words = torch.zeros(height * stride // 8, dtype=torch.int64)
+    seen, behind = torch.zeros(2, height * across, dtype=torch.int64)
+    scene = filled(
+        Items, verts=torch.zeros(verts, 3), window=torch.zeros(1, 4), views=1, shapes=1,
+        n_verts=verts, n_faces=faces, n_edges=edges, height=height, width=width, border=BORDER,
+    )  # fmt: skip
+    return filled(
+        Workspace, scene=scene, scratch=scratch_of((verts, faces, edges, grid, 2 * grid)),
+        stride=stride, across=across,
+        words=words, steps=words.view(torch.uint8),  # one memory, seen by words and by bytes
+        seen=seen, behind=behind, pairs=torch.empty(2 * grid, dtype=torch.int32),
+        keys=torch.empty(2 * grid, dtype=torch.int64), crossings=torch.empty(2 * grid, 4),
+        shift=torch.zeros(grid), moved=torch.zeros(2 * grid),
+        squares=torch.zeros(shifts, dtype=torch.float64),
+    )  # fmt: skip
 
 
 BRICK = 8  # [cells], as in `Volume.busy`
@@ -233,33 +220,26 @@ def kernel_of(known: SceneEvidence, config: SceneConfig) -> FusedEnergy:
     """The kernel of Eq. 1 with all that it needs to know."""
     from mover.energy.fused.kernels.data import KernelInput
 
-    wp, weights = started(), config.weights
+    weights, turn = config.weights, known.camera.R_cam_world.detach().clone()
     objects, camera, image, humans = known.objects, known.camera, known.image, known.humans
     queries, share, ends = _queries(objects, humans, weights)
     things, counts = _things(objects, ends)
-    data = KernelInput()
-    data.things = things
-    data.windows = _windows(image, humans, weights)
-    data.people = _people(known, weights, queries, share)
-    data.boxes = array(image.boxes.contiguous(), "vec4")
-    data.within = array((image.sides != image_terms.UNKNOWN).float(), "vec4")
     costs = torch.tensor([0.0, torch.inf, 0.0, image_terms.HIDDEN])  # by what is known of a side
-    data.beyond = array(costs[image.sides], "vec4")
-    data.facts = wp.from_torch(_facts(objects, image, humans, weights))
-    turn = camera.R_cam_world.detach().clone()
-    data.turn = array(turn[None], "mat33")
-    K = camera.K.tolist()
-    data.lens = wp.vec4(K[0][0], K[1][1], K[0][2], K[1][2])
-    data.weights = tuple(getattr(weights, name) for name in FUSED)
-    data.soft, data.rho = image_terms.SOFT, prior_terms.DISTANCE_RHO
-    data.sizes, data.growth = (prior_terms.LOWEST, prior_terms.HIGHEST), config.growth
-    views = image.views
+    data = filled(
+        KernelInput, things=things, windows=_windows(image, humans, weights),
+        people=_people(known, weights, queries, share), boxes=image.boxes.contiguous(),
+        within=(image.sides != image_terms.UNKNOWN).float(), beyond=costs[image.sides],
+        facts=_facts(objects, image, humans, weights), turn=turn[None],
+        lens=started().vec4(*lens_of(camera.K[None], 0)[0].tolist()),
+        weights=tuple(getattr(weights, name) for name in FUSED),
+        soft=image_terms.SOFT, sizes=(prior_terms.LOWEST, prior_terms.HIGHEST),
+        growth=config.growth, rho=prior_terms.DISTANCE_RHO,
+    )  # fmt: skip
     verts, faces, edges = (int(c.max()) for c in counts)
+    size = image.views.height + 2 * BORDER, image.views.width + 2 * BORDER
     shifts = 1 if image.borders is None else len(image.borders.shifts)
-    size = BufferSize(
-        verts, faces, edges, views.height + 2 * BORDER, views.width + 2 * BORDER, shifts
-    )
-    return FusedEnergy(data, size, counts[1], camera.R_cam_world, turn)
+    workspace = partial(_workspace, verts, faces, edges, size, shifts)
+    return FusedEnergy(data, workspace, counts[1], camera.R_cam_world, turn)
 
 
 def _things(objects: Objects, queries: Tensor) -> tuple[Any, list[Tensor]]:
@@ -271,13 +251,11 @@ def _things(objects: Objects, queries: Tensor) -> tuple[Any, list[Tensor]]:
     n, samples = objects.samples.shape[:2]
     per = torch.full((n,), samples)
     starts = [torch.cat([c.new_zeros(1), c.cumsum(0)]) for c in (*counts, per)]
-    things = ObjectData()
-    things.verts = array(objects.verts.detach()[real[0]], "vec3")
-    things.faces = array(objects.faces[real[1]].int(), "vec3i")
-    things.edges = array(objects.edges[real[2]].int(), "vec4i")
-    things.samples = array(objects.samples.detach().reshape(-1, 3).contiguous(), "vec3")
-    things.starts = started().from_torch(torch.stack([*starts, queries], -1).int().contiguous())
-    return things, counts
+    return filled(
+        ObjectData, verts=objects.verts[real[0]], faces=objects.faces[real[1]].int(),
+        edges=objects.edges[real[2]].int(), samples=objects.samples.reshape(-1, 3).contiguous(),
+        starts=torch.stack([*starts, queries], -1).int().contiguous(),
+    ), counts  # fmt: skip
 
 
 def real_parts(objects: Objects) -> list[Tensor]:
@@ -293,38 +271,33 @@ def real_parts(objects: Objects) -> list[Tensor]:
 def _windows(image: ImageCues, humans: HumanCues, weights: SceneWeights) -> Any:  # noqa: ANN401
     from mover.energy.fused.kernels.data import ImageData
 
-    views, windows = image.views, ImageData()
     mask, keep = image.masks.detach(), image.keep.to(image.masks)
-    windows.lens = array(lens_of(views.K.detach(), BORDER), "vec4")
     shifts, masks = mask.new_zeros(1), mask.unsqueeze(0)
     if image.borders is not None:
         shifts, masks = image.borders.shifts, image.borders.masks.detach()
-    windows.shifts, windows.loose = array(shifts.contiguous(), "float32"), image_terms.BORDER_WEIGHT
-    windows.mask, windows.keep = _grid(masks, 0.0), _grid(keep, 0.0)
     gain = torch.nn.functional.pad((keep * (1 - 2 * masks)).double(), [BORDER + 1, *[BORDER] * 3])
-    windows.gain = array(gain.cumsum(-1).view(-1), "float64")  # of the pixels of a row before each
-    windows.empty = array((keep * masks.double().square()).sum((-2, -1)).view(-1), "float64")
     area = (masks * keep).sum((-2, -1)).clamp_min(1)
-    windows.trust = array((image.trust / area).view(-1).contiguous(), "float32")
     lower, upper, bounded = _bounds(mask, humans, weights)
-    windows.lower, windows.upper = lower, upper
-    windows.bounded = array(bounded, "vec4i")
-    windows.limit, windows.fewest = human_terms.CLAMP, human_terms.FEWEST
-    return windows
+    return filled(
+        ImageData, lens=lens_of(image.views.K, BORDER), shifts=shifts.contiguous(),
+        loose=image_terms.BORDER_WEIGHT, mask=_grid(masks), keep=_grid(keep),
+        gain=gain.cumsum(-1).view(-1),  # of the pixels of a row before each
+        empty=(keep * masks.double().square()).sum((-2, -1)).view(-1),
+        trust=(image.trust / area).view(-1).contiguous(), lower=lower, upper=upper,
+        bounded=bounded, limit=human_terms.CLAMP, fewest=human_terms.FEWEST,
+    )  # fmt: skip
 
 
-def _grid(maps: Tensor, border: float) -> Any:  # noqa: ANN401
+def _grid(maps: Tensor, border: float = 0.0) -> Tensor:
     """Maps with a border, flat."""
     padded = torch.nn.functional.pad(maps, [BORDER] * 4, value=border)
-    return array(padded.contiguous().view(-1), "float32")
+    return padded.contiguous().view(-1)
 
 
-def _bounds(mask: Tensor, humans: HumanCues, weights: SceneWeights) -> tuple[Any, Any, Tensor]:
+def _bounds(mask: Tensor, humans: HumanCues, weights: SceneWeights) -> tuple[Tensor, ...]:
     """Lowest and highest depth of each pixel, and the rows and columns that have any."""
-    n = len(mask)
     if humans.depth is None or not weights.depth:
-        nothing = torch.zeros(n, 4, dtype=torch.int32)
-        return *(array(mask.new_zeros(1), "float32") for _ in range(2)), nothing
+        return mask.new_zeros(1), mask.new_zeros(1), torch.zeros(len(mask), 4, dtype=torch.int32)
     near, far = humans.depth.near, humans.depth.far
     known = (mask > 0.5) & (near < far) & (near.isfinite() | far.isfinite())
     lower = torch.where(known, near - human_terms.DEPTH_MARGIN, torch.inf)
@@ -333,7 +306,7 @@ def _bounds(mask: Tensor, humans: HumanCues, weights: SceneWeights) -> tuple[Any
         size, number = lines.shape[1], torch.arange(lines.shape[1])
         ends.append(torch.where(lines, number, size).amin(1))
         ends.append(torch.where(lines, number + 1, 0).amax(1))
-    upper = _grid(far + human_terms.DEPTH_MARGIN, 0.0)
+    upper = _grid(far + human_terms.DEPTH_MARGIN)
     return _grid(lower, torch.inf), upper, (torch.stack(ends, -1) + BORDER).int()
 
 
@@ -362,13 +335,10 @@ def _queries(
 def _people(known: SceneEvidence, weights: SceneWeights, queries: Tensor, share: Tensor) -> Any:  # noqa: ANN401
     from mover.energy.fused.kernels.data import HumanData
 
-    people = HumanData()
-    people.queries, people.share = array(queries, "vec3"), array(share, "float32")
-    people.rho = human_terms.CONTACT_RHO
-    objects = known.objects
-    people.top, people.back = (
-        array(x.detach().contiguous(), "vec3") for x in (objects.top, objects.back)
-    )
+    people = filled(
+        HumanData, queries=queries, share=share, rho=human_terms.CONTACT_RHO,
+        top=known.objects.top.contiguous(), back=known.objects.back.contiguous(),
+    )  # fmt: skip
     if weights.collision and known.humans.space is not None:
         volume = known.humans.space.volume
         some = volume.values[::BRICK, ::BRICK, ::BRICK]
@@ -387,8 +357,7 @@ def _facts(objects: Objects, image: ImageCues, humans: HumanCues, weights: Scene
     facts[:, 1] = share * human_terms.SAMPLES / max(1, objects.samples.shape[1])
     if image.distance is not None:
         facts[:, 2] = image.distance.clamp_min(1e-3).log()
-    touches: human_terms.ContactPoints | None = humans.touches
-    if touches is not None:
+    if (touches := humans.touches) is not None:
         facts[touches.object_of, 3:5] = touches.heading
         facts[touches.object_of, 5] = (touches.heading.square().sum(-1) > 0).to(facts)
     return facts

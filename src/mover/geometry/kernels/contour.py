@@ -3,9 +3,8 @@
 import warp as wp
 
 from mover.geometry.kernels.scene import Items, Scratch
-from mover.geometry.kernels.spans import TINY
+from mover.geometry.kernels.spans import HALF, TINY
 
-HALF = wp.constant(wp.uint64(32))
 LEVEL = 1e-6  # [px], edges shorter than this along their lines have no place to be cut
 STEEP, OUTWARD = 2, 1  # flags of a cut
 
@@ -38,16 +37,15 @@ class Gap:
 
 
 @wp.func
-def contour(scene: Items, scratch: Scratch, item: int, edge: wp.vec4l, face: wp.vec3l) -> Contour:
+def contour(scene: Items, scratch: Scratch, edge: wp.vec4l, face: wp.vec3l) -> Contour:
     """An edge between `face`, which is drawn and faces the camera, and one that does not."""
     c = Contour()
     i = int(edge[0])
     j = int(edge[1])
     k = int(face[0] + face[1] + face[2] - edge[0] - edge[1])
-    base = item * scene.n_verts
-    a = scratch.screen[base + i]
-    b = scratch.screen[base + j]
-    third = scratch.screen[base + k]
+    a = scratch.screen[i]
+    b = scratch.screen[j]
+    third = scratch.screen[k]
     normal_x = b[1] - a[1]
     normal_y = a[0] - b[0]
     inside = (third[0] - a[0]) * normal_x + (third[1] - a[1]) * normal_y

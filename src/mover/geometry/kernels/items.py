@@ -8,7 +8,7 @@ import warp as wp
 
 from mover.geometry.kernels.contour import contour, crossing, cut_of, gap, key, pull_cut
 from mover.geometry.kernels.scene import Items, MapArrays, Pull, Scratch
-from mover.geometry.kernels.spans import on_screen, paint, signed_area, triangle
+from mover.geometry.kernels.spans import fill, on_screen, run_of, signed_area, triangle
 from mover.geometry.kernels.surface import pull_pixel, show_pixel
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -33,9 +33,12 @@ def draw_face(scene: Items, scratch: Scratch, item: int, f: int, backs: int) -> 
     scratch.front[f] = wp.int8(wp.where(area < 0.0, 1, 0))
     if area < 0.0 or (area > 0.0 and backs != NOWHERE):
         t = triangle(a, b, c, face, wp.vec4i(0, scene.height, 0, scene.width))
-        near = area < 0.0 or backs == FRONT
         for row in range(t.first, t.last + 1):
-            paint(scene, scratch, t, wp.vec3i(0, row, f), near)
+            r = run_of(t, row, 0, scene.width)
+            if area < 0.0 or backs == FRONT:
+                fill(scratch.near, row * scene.width, r, f + 1)
+            else:
+                fill(scratch.far, row * scene.width, r, -f - 1)
 
 
 @wp.func
@@ -53,7 +56,7 @@ def enter_cuts(scene: Items, scratch: Scratch, item: int, e: int) -> None:
     edge = scene.edges[item % scene.shapes * scene.n_edges + e]
     f = outline_face(scratch, edge)
     if f >= 0:
-        c = contour(scene, scratch, 0, edge, face_at(scene, item, f))
+        c = contour(scene, scratch, edge, face_at(scene, item, f))
         for line in range(c.first, c.last + 1):
             g = gap(scene, c, line)
             if g.distance >= 0.0:
@@ -67,7 +70,7 @@ def keep_cuts(scene: Items, scratch: Scratch, maps: MapArrays, item: int, e: int
     edge = scene.edges[item % scene.shapes * scene.n_edges + e]
     f = outline_face(scratch, edge)
     if f >= 0:
-        c = contour(scene, scratch, 0, edge, face_at(scene, item, f))
+        c = contour(scene, scratch, edge, face_at(scene, item, f))
         for line in range(c.first, c.last + 1):
             g = gap(scene, c, line)
             if g.distance >= 0.0:

@@ -7,7 +7,6 @@ so that both decide the same for centres on an edge.
 import warp as wp
 
 from mover.geometry.camera import NEAR
-from mover.geometry.kernels.scene import Items, Scratch
 
 TINY = 1e-12  # [px], keeps the slope of level edges finite; their rows use its sign only
 AWAY = 1e9  # [px], vertices further off would overflow; their triangles are left out
@@ -155,17 +154,3 @@ def fill(keys: wp.array(dtype=wp.uint64), start: int, r: PixelRun, tag: int) -> 
         bits = wp.cast(wp.where(at > TINY, at, TINY), wp.uint32) ^ flip
         wp.atomic_max(keys, start + r.first + i, (wp.uint64(bits) << HALF) | face)
         i += 1
-
-
-@wp.func
-def paint(scene: Items, scratch: Scratch, t: Triangle, place: wp.vec3i, near: bool) -> None:
-    """Draw one row of a triangle to `near`, where the nearest wins, else to `far`.
-
-    Its place is the item within `scratch`, the row and the face.
-    """
-    start = (place[0] * scene.height + place[1]) * scene.width
-    r = run_of(t, place[1], 0, scene.width)
-    if near:
-        fill(scratch.near, start, r, place[2] + 1)
-    else:
-        fill(scratch.far, start, r, -place[2] - 1)

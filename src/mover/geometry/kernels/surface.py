@@ -7,12 +7,11 @@ than the plane through the vertices, from which the gradient comes.
 import warp as wp
 
 from mover.geometry.kernels.scene import Items, MapArrays, Pull
+from mover.geometry.kernels.spans import FULL, HALF
 
 GRAZING = 0.01  # sine of the angle below which a triangle's depth has no gradient
 AGREE = 1e-3  # relative difference of plane and scan line in 1/z beyond which the plane is noise
-FULL = wp.constant(wp.uint32(0x7FFFFFFF))
 LOW = wp.constant(wp.uint64(0xFFFFFFFF))
-HALF = wp.constant(wp.uint64(32))
 
 
 @wp.func
@@ -26,24 +25,6 @@ def inverse_depth(key: wp.uint64, farthest: bool) -> float:
     """Inverse depth [1/m] of the run that won a pixel."""
     flip = wp.where(farthest, FULL, wp.uint32(0))
     return wp.cast(wp.uint32(key >> HALF) ^ flip, wp.float32)
-
-
-@wp.func
-def item_of(scene: Items, pixel: int) -> int:
-    """Item that a pixel of the windows belongs to."""
-    border = 2 * scene.border
-    return pixel / ((scene.width - border) * (scene.height - border))
-
-
-@wp.func
-def ray_of(scene: Items, pixel: int) -> wp.vec3:
-    """Ray through the centre of a pixel of the windows, with a depth of 1."""
-    wide = scene.width - 2 * scene.border
-    high = scene.height - 2 * scene.border
-    k = scene.window[item_of(scene, pixel) % scene.views]
-    column = float(pixel % wide + scene.border) + 0.5
-    row = float(pixel / wide % high + scene.border) + 0.5
-    return wp.vec3((column - k[2]) / k[0], (row - k[3]) / k[1], 1.0)
 
 
 @wp.func
@@ -87,8 +68,13 @@ def pull_depth(
     """
     if gradient == 0.0:
         return
-    item = item_of(scene, pixel)
-    ray = ray_of(scene, pixel)
+    wide = scene.width - 2 * scene.border
+    high = scene.height - 2 * scene.border
+    item = pixel / (wide * high)
+    k = scene.window[item % scene.views]
+    column = float(pixel % wide + scene.border) + 0.5
+    row = float(pixel / wide % high + scene.border) + 0.5
+    ray = wp.vec3((column - k[2]) / k[0], (row - k[3]) / k[1], 1.0)
     corner = scene.faces[item % scene.shapes * scene.n_faces + face]
     base = item * scene.n_verts
     a = scene.verts[base + int(corner[0])]

@@ -85,15 +85,7 @@ def fronts(
     verts_cam: Float[Tensor, "items verts 3"], faces: Int[Tensor, "faces 3"], views: Crops
 ) -> Float[Tensor, "items h w"]:
     """Where rays enter closed bodies of one topology [m]; inf where they miss."""
-    points = verts_cam.detach().float().cpu()
-    size = (len(points), views.height, views.width)
-    most = max(1, MOST // max(views.height * views.width, points.shape[1], 1))
-    shape = Topology(faces[None], faces.new_zeros(1, 0, 4))
-    depth, face = torch.full(size, torch.inf), torch.empty(size, dtype=torch.int32)
-    for k in range(0, len(points) if len(faces) else 0, most):
-        some, part = slice(k, k + most), Crops(views.K[k : k + most], *size[1:])
-        draw.first_hit(points[some], shape, part, depth[some], face[some], draw.NOWHERE)
-    return depth.to(verts_cam)
+    return _nearest(verts_cam, faces, views, draw.NOWHERE)[0]
 
 
 def first_hit(
@@ -106,12 +98,23 @@ def first_hit(
 
     The size is height and width [px]; triangles need not be closed or consistent.
     """
+    depth, face = _nearest(verts_cam[None], faces, Crops(K[None], *size), draw.FRONT)
+    return depth[0], face[0].long()
+
+
+def _nearest(
+    verts_cam: Tensor, faces: Tensor, views: Crops, backs: int
+) -> tuple[Float[Tensor, "items h w"], Int[Tensor, "items h w"]]:
+    """First surfaces of items of one topology, a list that is cut where it is too long."""
+    points = verts_cam.detach().float().cpu()
+    size = (len(points), views.height, views.width)
+    most = max(1, MOST // max(views.height * views.width, points.shape[1], 1))
+    shape = Topology(faces[None], faces.new_zeros(1, 0, 4))
     depth, face = torch.full(size, torch.inf), torch.full(size, -1, dtype=torch.int32)
-    if len(verts_cam):
-        shape, views = Topology(faces[None], faces.new_zeros(1, 0, 4)), Crops(K[None], *size)
-        points = verts_cam.detach().float().cpu()[None]
-        draw.first_hit(points, shape, views, depth, face, draw.FRONT)
-    return depth.to(verts_cam), face.long().to(verts_cam.device)
+    for k in range(0, len(points) if points.shape[1] and len(faces) else 0, most):
+        some, part = slice(k, k + most), Crops(views.K[k : k + most], *size[1:])
+        draw.first_hit(points[some], shape, part, depth[some], face[some], backs)
+    return depth.to(verts_cam), face.to(verts_cam.device)
 
 
 def _depths(maps: Maps, like: Tensor) -> Depths:
@@ -156,7 +159,7 @@ class _Look(torch.autograd.Function):
         verts, nearest, farthest, covered = ctx.saved_tensors
         maps = Maps(verts.new_zeros(0), nearest, farthest, covered)
         pulled = verts.new_zeros(verts.shape)
-        named: dict[str, Tensor | None] = dict.fromkeys(("image", "nearest", "farthest"))
-        named.update(zip(named, grads, strict=False))
+        names = ("image", "nearest", "farthest")
+        named: dict[str, Tensor | None] = dict(zip(names, grads, strict=False))
         draw.pull(maps, ctx.trace, named, pulled)
         return pulled, None, None, None, None

@@ -36,7 +36,7 @@ def edge_of_outline(data: KernelInput, work: Workspace, p: Pose, e: int) -> Cont
     face = data.things.faces[data.things.starts[p.thing, FACES] + front]
     wide = wp.vec4l(wp.int64(edge[0]), wp.int64(edge[1]), wp.int64(edge[2]), wp.int64(edge[3]))
     corners = wp.vec3l(wp.int64(face[0]), wp.int64(face[1]), wp.int64(face[2]))
-    return contour(work.scene, work.scratch, 0, wide, corners)
+    return contour(work.scene, work.scratch, wide, corners)
 
 
 @wp.func
@@ -84,7 +84,10 @@ def list_cuts(work: Workspace, found: int) -> int:
             cut = work.scratch.cuts[i]
             x = crossing(work.scene, cut)
             if x.target >= 0:
-                target = on_grid(work, x.target)
+                border = work.scene.border  # from the window's pixel to that of the grid
+                wide = work.scene.width - 2 * border
+                row = x.target / wide + border
+                target = row * work.scene.width + x.target % wide + border
                 covered = wp.where(x.shift < 0.0, 1.0, 0.0)
                 work.scratch.cuts[n] = cut
                 work.scratch.targets[n] = target
@@ -92,14 +95,6 @@ def list_cuts(work: Workspace, found: int) -> int:
                 work.shift[target] = work.shift[target] + x.shift
                 n += 1
     return n
-
-
-@wp.func
-def on_grid(work: Workspace, pixel: int) -> int:
-    """The pixel of the grid for one of the window."""
-    border = work.scene.border
-    wide = work.scene.width - 2 * border
-    return (pixel / wide + border) * work.scene.width + pixel % wide + border
 
 
 @wp.func
