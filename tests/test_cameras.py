@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 import re
 import struct
 from collections.abc import Callable
@@ -14,16 +15,18 @@ import little_room
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from mover.core.errors import InputError
 from mover.core.types import STILL, Capture
+from mover.geometry.camera import pitch_roll
 from mover.geometry.path import from_reference, is_still, poses_at, scaled, to_reference
 from mover.io.capture.camera_file import path_of, path_to_arrays
 from mover.io.capture.folder import read_capture, write_capture
 from mover.io.capture.merge import import_into
 from mover.io.capture.parts import Parts
-from mover.io.files.cameras import read_camera_file
+from mover.io.files.cameras import camera_of_photo, read_camera_file, tilt_of_photo
 from mover.io.files.fields import At
 from mover.io.formats import chosen, names
 from mover.io.people.paths import read_colmap, read_slam, read_tum
@@ -361,3 +364,53 @@ def test_what_is_no_lens_is_named_in_the_users_words(kind, tmp_path):
         read_camera_file(written(tmp_path, name, content), None)
     assert str(caught.value).startswith(name)
     assert not re.search("Error|could not convert", str(caught.value))
+
+
+def apple_note(gravity: tuple[float, ...], order: str = ">") -> bytes:
+    """Apple's maker note with its version and an acceleration, as ExifTool's Apple.pm has it."""
+    mark, first = {">": b"MM", "<": b"II"}[order], 14 + 2 + 2 * 12 + 4
+    rows = struct.pack(order + "HHHIIHHIII", 2, 1, 9, 1, 14, 8, 10, 3, first, 0)
+    words = (n for value in gravity for n in (round(value * 1e6), 1_000_000))
+    return b"Apple iOS\0\0\1" + mark + rows + struct.pack(order + "6i", *words)
+
+
+def photo(path: Path, note: bytes, orientation: int = 1, lens: str = "back camera") -> Path:
+    picture = Image.new("RGB", (300, 200))
+    exif = picture.getexif()
+    exif[0x0112] = orientation
+    exif.get_ifd(0x8769).update({0xA405: 26, 0x927C: note, 0xA434: f"iPhone 13 Pro {lens}"})
+    picture.save(path, exif=exif)
+    return path
+
+
+@pytest.mark.parametrize(("orientation", "gravity", "tilt"), [
+    (6, (0.02683717579, -0.7210501641, -0.6948792783), (-43.9, 2.1)),  # ExifTool's example
+    (6, (0.0, -1.0, 0.0), (0, 0)), (8, (0.0, 1.0, 0.0), (0, 0)), (1, (-1.0, 0.0, 0.0), (0, 0)),
+    (3, (1.0, 0.0, 0.0), (0, 0)), (1, (-0.9397, 0.0, -0.3420), (-20, 0)),
+    (1, (-0.9848, -0.1736, 0.0), (0, 10)), (3, (0.9848, 0.1736, 0.0), (0, 10)),
+    (6, (0.1736, -0.9848, 0.0), (0, 10)), (8, (-0.1736, 0.9848, 0.0), (0, 10)),
+])  # fmt: skip
+@pytest.mark.parametrize("order", "><")
+def test_a_phones_photo_says_its_tilt(orientation, gravity, tilt, order, tmp_path):
+    file = photo(tmp_path / "p.jpg", apple_note(gravity, order), orientation)
+    said = tilt_of_photo(file)
+    turn = pitch_roll(torch.tensor(said["R_cam_world"]))
+    assert [math.degrees(float(a)) for a in turn] == pytest.approx(tilt, abs=0.1)
+    assert said["tilt_spread"] == pytest.approx(math.radians(1))
+    lens = camera_of_photo(file, (3000, 2000))
+    assert lens is not None
+    assert lens.value["fl_x"] == pytest.approx(3000 * 26 / 36)
+
+
+@pytest.mark.parametrize("note", [
+    b"", b"Apple iOS\0\0\1MM", apple_note((0.0, -1.0, 0.0))[:40], apple_note((0.0, -0.4, 0.0)),
+    b"Nikon\0\2\x10\0\0" + apple_note((0.0, -1.0, 0.0)),
+    apple_note((0.0, -1.0, 0.0)).replace((1_000_000).to_bytes(4, "big"), bytes(4)),
+])  # fmt: skip
+def test_a_photo_without_gravity_says_nothing(note, tmp_path):
+    assert tilt_of_photo(photo(tmp_path / "p.jpg", note, 6)) == {}
+    Image.new("RGB", (3, 2)).save(tmp_path / "bare.png")
+    assert tilt_of_photo(tmp_path / "bare.png") == {}
+    assert camera_of_photo(tmp_path / "bare.png", (3, 2)) is None
+    front = photo(tmp_path / "f.jpg", apple_note((0.0, -1.0, 0.0)), 6, "front camera")
+    assert tilt_of_photo(front) == {}

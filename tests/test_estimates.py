@@ -1,5 +1,6 @@
 """Lens, scale, statures and standard sizes: what is odd or uncertain is said, with its cure."""
 
+import math
 from dataclasses import replace
 
 import little_room
@@ -10,7 +11,14 @@ from mover.bodies.parts import parts_of
 from mover.bodies.skinning import open_body, zero_pose
 from mover.core.records import rows_of
 from mover.core.types import Bodies
-from mover.pipeline.estimates import lens_and_scale, odd_sizes, odd_statures, poor_fits
+from mover.geometry.camera import tilted
+from mover.pipeline.estimates import (
+    lens_and_scale,
+    odd_sizes,
+    odd_statures,
+    poor_fits,
+    tilt_by_feet,
+)
 
 CAMERA = little_room.camera()  # 400 px, 640 px wide: 77 degrees
 
@@ -76,3 +84,11 @@ def test_a_fit_that_misses_by_more_than_a_fortieth_of_the_height_is_named():
     high = 400 * 1.68 / 4  # [px] of an adult 4 m away
     (found,) = poor_fits(bodies, high * torch.tensor([0.02, 0.04]), CAMERA)
     assert found.startswith("person 1: the fit misses the keypoints by 4.")
+
+
+def test_a_tilt_that_feet_leave_open_is_named_with_what_would_narrow_it():
+    tilted_camera = replace(CAMERA, R_cam_world=tilted(torch.tensor(-0.2), torch.tensor(0.01)))
+    vague, sure = (tilt_by_feet(tilted_camera, math.radians(s)) for s in (1.9, 0.3))
+    assert sure == "camera: pitch -11.5°, roll 0.6°, by the feet ± 0.3°"
+    assert vague.startswith("camera: pitch -11.5°, roll 0.6°, by the feet ± 1.9°; ")
+    assert "--tilt" in vague

@@ -1,8 +1,10 @@
 """The same masks in every layout, and parts of captures that come one after the other."""
 
 import base64
+import dataclasses
 import io
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ import pytest
 import torch
 from kept_mats import mats_read_once as mats_read_once  # for every test
 from PIL import Image
+from test_cameras import apple_note
 from test_import_scenes import camera_at, capture_of
 from test_import_scenes import plain as plain  # the fixture
 
@@ -19,7 +22,7 @@ from mover.app.cli.imports import ImportArgs, run_import
 from mover.core.errors import InputError
 from mover.core.types import Capture, Masks
 from mover.geometry.boxes import box_of
-from mover.geometry.camera import to_camera
+from mover.geometry.camera import pitch_roll, to_camera
 from mover.geometry.rle import decode
 from mover.io.capture.folder import read_capture
 from mover.io.capture.merge import import_into
@@ -204,6 +207,62 @@ def test_a_new_tilt_keeps_box_centres_in_the_camera(plain, tmp_path):
         after = to_camera(box_of(b).center, second.scene.camera.R_cam_world)
         assert torch.allclose(before, after, atol=1e-4)
     assert second.scene.camera.R_cam_world.tolist() == layouts.FLIP.tolist()
+
+
+def test_a_measured_tilt_and_height_stay_when_other_parts_come(plain, tmp_path):
+    out = tmp_path / "out"
+    capture_of("total3d", layouts.write_total3d(tmp_path / "in", plain), tmp_path)
+    known = command(tmp_path, "folder", out, tilt=(-12.0, 3.0, 2.0), camera_height=1.3)
+    tilt = known.tilt
+    degrees = [math.degrees(angle) for angle in (tilt.pitch, tilt.roll, tilt.spread)]
+    assert degrees == pytest.approx([-12, 3, 2], abs=1e-4)
+    found = [math.degrees(float(a)) for a in pitch_roll(known.scene.camera.R_cam_world)]
+    assert found == pytest.approx([-12, 3], abs=1e-4)
+    later = command(
+        tmp_path, "folder", out, fov=70.0, image=picture(tmp_path / "i.png", plain.size)
+    )
+    assert dataclasses.astuple(later.tilt) == pytest.approx(dataclasses.astuple(tilt), abs=1e-6)
+    assert (known.camera_height, later.camera_height) == (1.3, 1.3)
+    (tmp_path / "other.json").write_text(json.dumps(camera_at(plain).value))
+    assert command(tmp_path, "folder", out, camera=tmp_path / "other.json").tilt is None
+
+
+def picture(path: Path, size: tuple[int, int], exif: Any = None) -> Path:
+    Image.new("RGB", size).save(path, **({} if exif is None else {"exif": exif}))
+    return path
+
+
+def test_a_photo_gives_its_lens_and_tilt_and_other_numbers_are_refused(tmp_path):
+    exif = Image.new("RGB", (1, 1)).getexif()
+    exif.get_ifd(0x8769).update({0xA405: 26, 0x927C: apple_note((-0.9397, 0.0, -0.3420))})
+    masks = layouts.write_masks(tmp_path / "in", drawn(), WORDS)["coco_text"]
+    photo, out = picture(tmp_path / "p.jpg", (64, 48), exif), tmp_path / "out"
+    run_import(ImportArgs("masks", masks, out, image=photo))
+    camera = json.loads((out / "camera.json").read_text())
+    assert camera["fl_x"] == pytest.approx(80 * 26 / math.hypot(36, 24))
+    assert camera["focal_spread"] == 0.05
+    turn = pitch_roll(torch.tensor(camera["R_cam_world"]))
+    assert [math.degrees(float(a)) for a in turn] == pytest.approx([-20, 0], abs=0.01)
+    assert camera["tilt_spread"] == pytest.approx(math.radians(1))
+    for wrong in ((3.0,), (90.0, 0.0), (0.0, 0.0, 0.0), (0.0, math.nan), (1.0, 2.0, 3.0, 4.0)):
+        with pytest.raises(InputError, match=r"--tilt: has .* expected pitch"):
+            run_import(ImportArgs("masks", masks, out, tilt=wrong))
+    with pytest.raises(InputError, match="there is no lens"):
+        run_import(ImportArgs("masks", masks, tmp_path / "new", tilt=(1.0, 2.0)))
+    bare = picture(tmp_path / "bare.png", (64, 48))
+    with pytest.raises(InputError, match=r"bare\.png: has no focal length in its EXIF"):
+        run_import(ImportArgs("masks", masks, tmp_path / "new", image=bare, camera=bare))
+
+
+def test_a_photo_that_is_stored_on_its_side_is_as_large_as_it_is_shown(tmp_path):
+    exif = Image.new("RGB", (1, 1)).getexif()
+    exif[0x0112] = 6
+    photo = picture(tmp_path / "p.jpg", (48, 64), exif)
+    masks = layouts.write_masks(tmp_path / "in", drawn(), WORDS)["coco_text"]
+    run_import(ImportArgs("masks", masks, tmp_path / "out", image=photo, fov=60.0))
+    camera = json.loads((tmp_path / "out" / "camera.json").read_text())
+    with Image.open(tmp_path / "out" / "reference.png") as shown:
+        assert shown.size == (camera["w"], camera["h"]) == (64, 48)
 
 
 @pytest.mark.parametrize("tracks", [[4, 9], [4]])

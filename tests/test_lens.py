@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import json
 import math
 from pathlib import Path
 
@@ -12,12 +13,15 @@ import torch
 from kept_rooms import thinned
 from test_pipeline import light
 
+from mover.core.errors import InputError
+from mover.core.records import rows_of
 from mover.core.run import Run
-from mover.core.types import Camera
+from mover.core.types import Camera, Tilt
 from mover.geometry.boxes import box_of
-from mover.geometry.camera import project, tilted
+from mover.geometry.camera import pitch_roll, project, tilted
 from mover.geometry.rotations import axis_angle, rot_y
 from mover.io.capture.folder import read_capture, write_capture
+from mover.pipeline.people import estimate_people, through_its_lens
 from mover.pipeline.presets import PAPER, ROBUST
 from mover.pipeline.reconstruct import reconstruct
 from mover.stages.camera.find_lens import LensInputs, find_lens, through_lens
@@ -295,6 +299,51 @@ def test_a_capture_keeps_what_it_says_of_its_lens(small_room, tmp_path):
     assert not silent.focal_by_lines
     write_capture(dataclasses.replace(guessed, focal_by_lines=True), tmp_path / "by lines")
     assert read_capture(tmp_path / "by lines").focal_by_lines
+
+
+def test_a_capture_keeps_a_measured_tilt_beside_that_of_its_scene(small_room, tmp_path):
+    camera = small_room.capture.scene.camera
+    pitch, roll = (float(a) + 0.02 for a in pitch_roll(camera.R_cam_world))
+    tilt = Tilt(pitch, roll, 0.01)
+    write_capture(dataclasses.replace(small_room.capture, tilt=tilt), tmp_path)
+    back = read_capture(tmp_path)
+    assert dataclasses.astuple(back.tilt) == pytest.approx(dataclasses.astuple(tilt), abs=1e-6)
+    assert torch.allclose(back.scene.camera.R_cam_world, camera.R_cam_world, atol=1e-6)
+    assert not [w for w in back.warnings if "camera" in w]
+    given = json.loads((tmp_path / "camera.json").read_text())
+    for change, said in (
+        ({"tilt_spread": 0}, "tilt_spread"), ({"R_cam_world": None}, "tilt_spread.*R_cam_world"),
+    ):  # fmt: skip
+        (tmp_path / "camera.json").write_text(json.dumps({**given, **change}))
+        with pytest.raises(InputError, match=rf"camera\.json.*{said}"):
+            read_capture(tmp_path)
+
+
+@pytest.mark.parametrize("lines", [True, False])
+@pytest.mark.parametrize("config", [PAPER, ROBUST], ids=["paper", "robust"])
+def test_a_measured_tilt_holds_where_one_step_leaves_the_camera_open(
+    small_room, config, lines: bool, tmp_path
+):
+    whole, true = thinned(small_room.capture), small_room.truth.camera
+    one = rows_of(whole.bodies, whole.bodies.frame == whole.bodies.frame.max())
+    pitch, roll = (float(a) for a in pitch_roll(true.R_cam_world))
+    wrong = tilted(torch.tensor(pitch + 0.05), torch.tensor(roll - 0.05))
+    scene = dataclasses.replace(whole.scene, camera=dataclasses.replace(true, R_cam_world=wrong))
+    capture = dataclasses.replace(whole, scene=scene, bodies=one, people=None)
+    if not lines:
+        capture = dataclasses.replace(capture, reference=None)
+
+    def off(tilt: Tilt | None) -> float:
+        given = dataclasses.replace(capture, tilt=tilt)
+        given = through_its_lens(given, config, Run(tmp_path / str(tilt)), ())
+        found = estimate_people(given, config, Run(tmp_path / str(tilt))).alignment
+        angles = pitch_roll(found.camera.R_cam_world)
+        return max(abs(float(a) - b) for a, b in zip(angles, (pitch, roll), strict=True))
+
+    measured = Tilt(pitch + 0.003, roll - 0.003, 0.005)
+    assert off(measured) < 0.005
+    if not (lines and config.lens.use):
+        assert off(None) > 0.02
 
 
 @pytest.mark.slow

@@ -11,9 +11,11 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from mover.core.errors import InputError
+from mover.geometry.camera import pitch_roll
 from mover.io.files.cameras import GUESSED
-from mover.perceive.capture import exif_focal, lens_of
+from mover.perceive.capture import camera_by, lens_of
 from mover.perceive.config import FramesConfig
+from mover.perceive.own import Video
 from mover.perceive.reference import LEAST, median
 from mover.perceive.steady import Drift, align, find_drift, moved, steady_frames, warnings_of, warp
 from mover.perceive.video import Clip, read_picture, stamp_of
@@ -207,9 +209,14 @@ def test_the_lens_comes_from_the_file_the_angle_or_the_photo(tmp_path: Path):
     exif = picture.getexif()
     exif.get_ifd(0x8769)[0xA405] = 28
     picture.save(tmp_path / "p.jpg", exif=exif)
-    assert exif_focal(tmp_path / "p.jpg", (3600, 2400)) == pytest.approx(2800)
     at, text = lens_of((3600, 2400), tmp_path / "p.jpg")
-    assert text is None
+    assert (at.value["fl_x"], text) == (pytest.approx(2800), None)
+    photo = Video(tmp_path / "p.jpg", tilt=(-10.0, 2.0, 0.5), camera_height=1.3)
+    known, _ = camera_by(photo, (3600, 2400))
+    assert (known.value["fl_x"], known.value["height"]) == (pytest.approx(2800), 1.3)
+    turn = pitch_roll(torch.tensor(known.value["R_cam_world"]))
+    assert [math.degrees(float(a)) for a in turn] == pytest.approx([-10, 2], abs=1e-4)
+    assert known.value["tilt_spread"] == pytest.approx(math.radians(0.5))
     _, text = lens_of((3600, 2400))
     assert "--fov" in (text or "")
 

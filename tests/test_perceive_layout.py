@@ -277,6 +277,11 @@ def test_edges_of_the_picture_tell_tilt_and_heading(people: bool, small_room, tm
     nothing = seen_from(blank, None, Run(tmp_path))
     assert (nothing.tilt_spread, nothing.heading) == (None, None)
     assert torch.equal(nothing.camera.R_cam_world, guess)
+    measured = replace(blank, camera=true, tilt_spread=0.005)
+    held = seen_from(measured, small_room.bodies if people else None, Run(tmp_path))
+    pairs = zip(pitch_roll(held.camera.R_cam_world), pitch_roll(true.R_cam_world), strict=True)
+    assert max(abs(float(a - b)) for a, b in pairs) < math.radians(0.1)
+    assert held.tilt_spread == 0.005
 
 
 @pytest.mark.slow
@@ -361,11 +366,21 @@ def test_a_first_scene_that_is_made_again_begins_where_the_first_did(pieces, tmp
     folder = tmp_path / "c"
     write_capture_without_scene(folder, picture(pieces[:1], level))
     first = FirstScene(Scene(found, -1.4, ()), (), ())
-    write_first_scene(first, folder, read_picture_of(folder).camera)
-    told = json.loads((folder / "camera.json").read_text())["R_cam_world"]
-    torch.testing.assert_close(torch.tensor(told), found.R_cam_world)
-    again = read_picture_of(folder).camera
-    torch.testing.assert_close(again.R_cam_world, level.R_cam_world, rtol=0, atol=1e-6)
+    write_first_scene(first, folder, read_picture_of(folder))
+    told = json.loads((folder / "camera.json").read_text())
+    torch.testing.assert_close(torch.tensor(told["R_cam_world"]), found.R_cam_world)
+    assert told["tilt_spread"] == first.tilt.spread > 0
+    seen = read_picture_of(folder)
+    torch.testing.assert_close(seen.camera.R_cam_world, level.R_cam_world, rtol=0, atol=1e-6)
+    assert seen.tilt_spread is None
+    measured = {**camera_to_json(own), "tilt_spread": 0.01}
+    write_json(measured, folder / "camera.json")
+    assert read_picture_of(folder).tilt_spread == 0.01
+    write_first_scene(first, folder, read_picture_of(folder))
+    told = json.loads((folder / "camera.json").read_text())
+    assert (told["R_cam_world"], told["tilt_spread"]) == (measured["R_cam_world"], 0.01)
+    write_json(camera_to_json(level), folder / "camera.json")
+    write_first_scene(first, folder, read_picture_of(folder))
     write_json(camera_to_json(own), folder / "camera.json")
     torch.testing.assert_close(read_picture_of(folder).camera.R_cam_world, own.R_cam_world)
     write_json(camera_to_json(found), folder / "camera.json")

@@ -92,8 +92,9 @@ def judge_scene(scene: I3dbScene, run: Run, preset: str) -> dict[str, Any]:
     }
     given = wrongly_placed(scene, camera)
     numbers |= overlaps("given", given.objects, scene)
-    for name, start in (("run", first.scene), ("run_given", given)):
-        room = reconstruct(capture_of(scene, start, bodies), PRESETS[preset], run)
+    for name, start, tilt in (("run", first.scene, first.tilt), ("run_given", given, None)):
+        capture = replace(capture_of(scene, start, bodies), tilt=tilt)
+        room = reconstruct(capture, PRESETS[preset], run)
         numbers |= overlaps(name, room.scene.objects, scene)
         numbers |= camera_errors(name, room.scene, scene.truth)
     return numbers

@@ -211,7 +211,7 @@ class Heading:
 
 @record
 class Tilt:
-    """Pitch and roll as the lines of the reference picture show them [rad]."""
+    """Pitch and roll as they were measured, or as lines of the picture show them [rad]."""
 
     pitch: float
     roll: float

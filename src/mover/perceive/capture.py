@@ -31,12 +31,19 @@ from mover.io.capture.annotations_file import (
     people_of,
     people_to_json,
 )
-from mover.io.capture.camera_file import camera_of, camera_to_json
+from mover.io.capture.camera_file import camera_of, camera_to_json, measured_tilt
 from mover.io.capture.folder import folder_parts
 from mover.io.capture.scene_file import write_hypotheses, write_scene
-from mover.io.files.cameras import guessed_view, of_view, read_camera_file, with_spread
+from mover.io.files.cameras import (
+    camera_of_photo,
+    guessed_view,
+    of_view,
+    read_camera_file,
+    with_known,
+    with_spread,
+)
 from mover.io.files.fields import At, read_json, write_json
-from mover.io.files.images import find_depth_file, opened, read_depth, reference_frame, write_image
+from mover.io.files.images import find_depth_file, read_depth, reference_frame, write_image
 from mover.io.people.keypoints import write_keypoints
 from mover.perceive import mediapipe, networks
 from mover.perceive.config import ModelsConfig, PerceiveConfig
@@ -50,6 +57,7 @@ from mover.perceive.video import (
     PICTURES,
     Clip,
     TakeInputs,
+    pictures_of,
     rate_of,
     stamp_of,
     take_frames,
@@ -65,17 +73,15 @@ BEND, OFTEN = 0.15, 0.9  # of the height: second difference of the trunk, and of
 DENSEST = 20.0  # frames a second
 CHUNK = 50  # frames whose detections are kept together
 # How far off a focal length may be, of its logarithm; what a file gives stays as it is.
-BY_EXIF = 0.05  # of a photo, while a video is cut by what steadies it
 ASSUMED = 0.15  # cameras of phones and rooms are 50 to 75 degrees wide
-FULL_FRAME = math.hypot(36, 24)  # [mm], diagonal to which "equivalent" focal lengths refer
 SAME_FORMAT = 0.01  # difference of two ratios of width and height
 GUESS = "perceived/guess.json"  # the camera before a first scene, and as it left it
-LENS_FIELDS = ("height", "focal_spread", "focal_by_lines")  # of camera.json, beside the camera
+LENS_FIELDS = ("height", "focal_spread", "focal_by_lines", "tilt_spread")
+"""Of camera.json, beside the camera."""
 SAME_TILT = 1e-6  # elements of a rotation that was read back
 TILT = math.radians(8)  # of a camera on a shelf, before anything is seen of it
 CLEARLY = 2.0  # standard deviations by which lines contradict a lens before any body is seen
 USUAL = 60.0  # [degrees], horizontal field of view of phones held level, where nothing is known
-EXIF_IFD, FOCAL_35 = 0x8769, 0xA405
 
 
 @dataclass(frozen=True)
@@ -97,7 +103,7 @@ def perceive(
             all else is written.
     """
     clip, drift, tracks, joints = moving_people(video, out, config, run, say, finders)
-    at, text = lens_of((clip.width, clip.height), video.camera, video.fov)
+    at, text = camera_by(video, (clip.width, clip.height))
     if text is not None:
         say(f"warning: {text}")
     camera = camera_of(at)
@@ -268,6 +274,18 @@ def lens_by_lines(
     return zoomed(camera, found.zoom), {"focal_spread": found.spread, "focal_by_lines": True}
 
 
+def camera_by(video: Video, size: tuple[int, int]) -> tuple[At, str | None]:
+    """The fields of camera.json by all that is given, and a warning where the lens is a guess.
+
+    A single picture may be a photo, whose EXIF counts.
+    """
+    pictures = pictures_of(video.source)
+    photo = pictures[0] if len(pictures) == 1 else None
+    file = photo if video.camera is None and video.fov is None else video.camera
+    at, text = lens_of(size, file, video.fov)
+    return with_known(at, video.tilt, video.camera_height, photo), text
+
+
 def lens_of(
     size: tuple[int, int], file: Path | None = None, fov: float | None = None
 ) -> tuple[At, str | None]:
@@ -287,11 +305,9 @@ def lens_of(
         return _in_pixels_of(size, read_camera_file(file, size)), None
     if fov is not None:
         return guessed_view(fov, size), None
-    focal = None if photo is None else exif_focal(photo, size)
-    if focal is not None:
-        w, h = size
-        fields = {"w": w, "h": h, "fl_x": focal, "fl_y": focal, "cx": w / 2, "cy": h / 2}
-        return with_spread(At(fields, "EXIF"), BY_EXIF), None
+    known = None if photo is None else camera_of_photo(photo, size)
+    if known is not None:
+        return known, None
     text = (
         f"the lens is not known: {USUAL:.0f} degrees across are assumed; give --camera FILE or "
         "--fov DEGREES (GeoCalib, MoGe and others estimate both lens and tilt)"
@@ -317,21 +333,6 @@ def _in_pixels_of(size: tuple[int, int], at: At) -> At:
     return at.holding({**scaled, "w": size[0], "h": size[1]})
 
 
-def exif_focal(photo: Path, size: tuple[int, int]) -> float | None:
-    """Focal length of a picture's EXIF [px]; None: it gives none.
-
-    The 35 mm equivalent refers to the diagonal, so it holds for any format and either way up.
-
-    Raises:
-        InputError: If it is no picture.
-    """
-    with opened(photo) as picture:
-        found: Any = picture.getexif().get_ifd(EXIF_IFD).get(FOCAL_35)
-    if found is None or not 1 <= float(found) <= 2000:
-        return None
-    return float(found) / FULL_FRAME * math.hypot(*size)
-
-
 def read_picture_of(folder: Path) -> Picture:
     """Camera, annotations and hidden pixels of a capture that needs no scene yet.
 
@@ -344,8 +345,8 @@ def read_picture_of(folder: Path) -> Picture:
     file = folder / "camera.json"
     if not file.exists() or parts.objects is None:
         raise InputError(f"{folder}: a first scene needs camera.json and objects.json in it")
-    given = read_json(file)  # not the camera of a scene that is made again
-    camera = _guessed(folder, camera_of(given))
+    given = _before(folder, read_json(file))  # not the camera of a scene that is made again
+    camera, tilt = camera_of(given), measured_tilt(given)
     detections = detections_of(parts.objects, camera, log.warning)
     blank = torch.zeros(camera.height, camera.width, dtype=torch.bool)
     masks = [blank if d.mask is None else decode(d.mask, 0) for d in detections]
@@ -362,10 +363,11 @@ def read_picture_of(folder: Path) -> Picture:
         if depth is None or not depth[1]  # in metres
         else read_depth(depth[0], camera, frame=reference_frame(folder)),
         reference=None if parts.load_image is None else parts.load_image(camera),
+        tilt_spread=None if tilt is None else tilt.spread,
     )
 
 
-def _guessed(folder: Path, camera: Camera) -> Camera:
+def _before(folder: Path, given: At) -> At:
     """The camera with the tilt that it had before a first scene found another one.
 
     So a first scene that is made again begins where the first did; another tilt in camera.json, of
@@ -373,23 +375,32 @@ def _guessed(folder: Path, camera: Camera) -> Camera:
     """
     file = folder / GUESS
     if not file.is_file():
-        return camera
+        return given
     try:
-        before, found = (camera_of(read_json(file).get(name)) for name in ("before", "found"))
+        known = read_json(file)
+        before, found = (camera_of(known.get(name)) for name in ("before", "found"))
     except InputError:  # a cache: what is damaged is no news
-        return camera
-    same = torch.allclose(found.R_cam_world, camera.R_cam_world, rtol=0, atol=SAME_TILT)
-    return replace(camera, R_cam_world=before.R_cam_world) if same else camera
+        return given
+    turn, own = before.R_cam_world, camera_of(given).R_cam_world
+    if not torch.allclose(found.R_cam_world, own, rtol=0, atol=SAME_TILT):
+        return given
+    fields = {name: value for name, value in given.value.items() if name != "tilt_spread"}
+    return given.holding({**fields, "R_cam_world": turn.tolist()})
 
 
-def write_first_scene(first: FirstScene, folder: Path, guess: Camera) -> None:
-    """Write scene.json with its meshes, and the tilt that `guess` had not, into a capture."""
+def write_first_scene(first: FirstScene, folder: Path, guess: Picture) -> None:
+    """Write scene.json with its meshes into a capture, and the tilt where `guess` had none."""
     write_scene(first.scene, folder / "scene.json")
     parts = folder_parts(folder)
     assert parts.camera is not None
     given = {k: v for k, v in parts.camera.value.items() if k in LENS_FIELDS}
-    found = camera_to_json(first.scene.camera)
+    before, found = (camera_to_json(camera) for camera in (guess.camera, first.scene.camera))
+    if guess.tilt_spread is None:
+        given["tilt_spread"] = first.tilt.spread
+        write_json({"before": before, "found": found}, folder / GUESS)
+    else:  # it was measured
+        given["R_cam_world"] = before["R_cam_world"]
+        (folder / GUESS).unlink(missing_ok=True)
     write_json({**found, **given}, folder / "camera.json")
-    write_json({"before": camera_to_json(guess), "found": found}, folder / GUESS)
     groups = {group[0].piece.id: [h.piece for h in group] for group in first.others}
     write_hypotheses(folder, groups)

@@ -23,14 +23,23 @@ from torch import Tensor
 from mover.core.errors import InputError
 from mover.core.records import record, rows_of
 from mover.core.run import Run
-from mover.core.types import Camera, Detection, Heading, Layout, Mesh, Scene, SceneObject
+from mover.core.types import (
+    Camera,
+    Detection,
+    Heading,
+    Layout,
+    Mesh,
+    Scene,
+    SceneObject,
+    Tilt,
+)
 from mover.energy.config import SceneConfig
 from mover.energy.fused.energy import energy_function
 from mover.energy.human_terms import DepthRange
 from mover.energy.objective import HumanCues, ImageCues
 from mover.energy.prior_terms import Given
 from mover.furniture.library import WALL_PIECES, canonical, catalogue, choose_piece, meanings
-from mover.geometry.camera import to_world
+from mover.geometry.camera import pitch_roll, to_world
 from mover.geometry.crops import sample_nearest
 from mover.geometry.mesh import box, used
 from mover.geometry.raster import Crops
@@ -71,6 +80,7 @@ SOUGHT = 0.04
 """Error of the scale of a first scene (rooms 100 to 104), as a logarithm."""
 TURNED_APART = 0.6  # [rad], turns that are nearer count as one start
 SAME = 1.05, 0.002  # times the energy, and beside it: an outline that is the same from behind
+OFF = math.radians(2.0)  # of pitch and roll of first scenes, as in four scenes of i3DB [rad]
 LEVEL = 0.92  # cosine of the largest tilt of a surface that counts as floor
 CELL = 0.04  # [m], height of a slice in which floor is counted
 ENOUGH = 0.25  # of the fullest slice: the lowest slice with so much is the floor
@@ -185,7 +195,7 @@ class Picture:
     reference: Float[Tensor, "h w 3"] | None = None
     """The picture itself, in [0, 1]."""
     tilt_spread: float | None = None
-    """Standard deviation of pitch and roll where lines of the image constrain them [rad]."""
+    """Standard deviation of pitch and roll where they were measured or lines show them [rad]."""
     heading: Heading | None = None
     """Heading of the room, where they constrain it."""
     segments: Segments | None = None
@@ -210,6 +220,12 @@ class FirstScene:
     """Hypotheses of each object, best first; the first is the one in the scene."""
     skipped: tuple[str, ...]
     """Classes of things that do not stand on the ground and were left out."""
+
+    @property
+    def tilt(self) -> Tilt:
+        """Of its camera, and how far off that may be."""
+        pitch, roll = (float(a) for a in pitch_roll(self.scene.camera.R_cam_world.double()))
+        return Tilt(pitch, roll, OFF)
 
 
 def first_scene(

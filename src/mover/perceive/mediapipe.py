@@ -94,7 +94,7 @@ def find_poses(
             codes.append(encode(torch.from_numpy(mask)))
             frames.append(frame)
             found.append((points, sure))
-        observe(Step("find_poses", frame + 1, len(clip.time)))
+        observe(Step("find_poses", frame, len(clip.time)))
     points = np.array([p for p, _ in found]).reshape(-1, 33, 2)
     low, high = points.min(1), points.max(1)
     person = followed(frames, (low + high) / 2, np.linalg.norm(high - low, axis=1))

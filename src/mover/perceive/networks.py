@@ -93,7 +93,7 @@ def find_instances(clip: Clip, config: PerceiveConfig, observe: Observer = silen
         frames = range(begin, min(begin + PICTURES, count))
         pictures = [read_picture(clip.path(k)) for k in frames]
         parts.append(instances(net, pictures, frames, config.score))
-        observe(Step("find_instances", frames.stop, count))
+        observe(Step("find_instances", frames.stop - 1, count))
     return joined_finds(parts)
 
 
@@ -169,7 +169,7 @@ def find_joints(
         frames = tracks.frame[begin : begin + PEOPLE].tolist()
         pictures = [read_picture(inputs.clip.path(k)) for k in frames]
         parts.append(joints_in(net, pictures, boxes[begin : begin + PEOPLE]))
-        observe(Step("find_joints", begin + len(frames), len(boxes)))
+        observe(Step("find_joints", begin + len(frames) - 1, len(boxes)))
     found = torch.cat(parts)
     return Keypoints(
         found[..., :2], found[..., 2].clamp(0, 1), "coco17", tracks.frame, tracks.person,

@@ -39,6 +39,10 @@ class Video:
     """A calibration, or a photo of the same camera."""
     fov: float | None = None
     """Horizontal field of view [degrees]."""
+    tilt: tuple[float, ...] = ()
+    """Measured pitch and roll, and how far off they may be [degrees]."""
+    camera_height: float | None = None
+    """Of the camera above the floor [m]."""
     keypoints: Callable[[], Path] | None = None
     """Gives the file of people's joints, once the frames are written."""
     of_frames: bool = False

@@ -36,7 +36,7 @@ def seen_from(picture: Picture, bodies: Bodies | None, run: Run) -> Picture:
     """The picture with the camera and heading of the room by feet and by its own edges."""
     by_feet = picture if bodies is None else standing_on(picture, bodies, run)
     found = along_edges(by_feet)
-    if bodies is None or found.tilt_spread is None:
+    if bodies is None or found.tilt_spread == by_feet.tilt_spread:
         return found
     return standing_on(replace(found, prior=None), bodies, run)
 
@@ -48,7 +48,7 @@ def along_edges(picture: Picture) -> Picture:
         return picture
     centre, masks = camera.K[:2, 2], picture.masks
     segments = find_segments(picture.reference, picture.people, centre, SURE, masks)
-    spread = LensConfig.tilt
+    spread = min(LensConfig.tilt, picture.tilt_spread or math.inf)
     if picture.prior is not None:
         tilts = torch.linalg.inv(picture.prior.precision).diagonal()[:2]
         spread = min(spread, float(tilts.amax()) ** 0.5)

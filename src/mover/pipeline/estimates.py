@@ -11,6 +11,7 @@ from mover.core.types import Bodies, Camera, SceneObject
 from mover.fitting.priors import ADULT, ADULTS, size_of
 from mover.furniture.library import STANDARD, canonical
 from mover.geometry.boxes import box_of
+from mover.geometry.camera import pitch_roll
 from mover.stages.camera.find_foot_contacts import straight_legs
 from mover.stages.objects.gather_given import MEANINGS
 from mover.stages.people.find_depth import pelvis
@@ -18,6 +19,7 @@ from mover.stages.people.find_depth import pelvis
 ODD = 2.5  # standard deviations from the population or a standard, from which there is a warning
 POOR = 0.025  # of a person's height: keypoints that a fit misses by more
 LOOSE = 0.02  # spread of the logarithm of a focal length, or of a room's size: worth a cure
+TILTED = math.radians(1.0)  # spread of pitch or roll: worth a cure [rad]
 AXES = ("wide", "high", "deep")
 
 
@@ -43,6 +45,20 @@ def lens_and_scale(camera: Camera, lens: float | None, size: float | None) -> tu
             "; a person's height (mover fit --height, 'heights' in people.json) would narrow it"
         )
     return text, scale
+
+
+def tilt_by_feet(camera: Camera, spread: float) -> str:
+    """Pitch and roll of a room's camera, and what would narrow them.
+
+    `spread` is the larger standard deviation [rad] by the feet and what was measured.
+    """
+    pitch, roll, off = (
+        math.degrees(float(angle)) for angle in (*pitch_roll(camera.R_cam_world), spread)
+    )
+    text = f"camera: pitch {pitch:.1f}°, roll {roll:.1f}°, by the feet ± {off:.1f}°"
+    if spread > TILTED:
+        text += "; a measured tilt (mover import --tilt) would narrow it"
+    return text
 
 
 def odd_statures(bodies: Bodies, parts: BodyParts) -> tuple[str, ...]:

@@ -66,16 +66,18 @@ def through_its_lens(
     segments = lines_of(capture, config, FINE if guessed else SURE)
     if segments is None:
         return capture
-    people, tilt = locate(capture, config, run), config.lens.tilt
+    people, tilt, measured = locate(capture, config, run), config.lens.tilt, capture.tilt
     if people is not None:
         camera = replace(camera, R_cam_world=people.alignment.camera.R_cam_world)
         spread = people.alignment.covariance.diag()[:2].amax()
         tilt = min(tilt, math.hypot(config.lens.feet, float(spread) ** 0.5))
-    by_feet = guessed and people is not None
+    if measured is not None:
+        camera, tilt = tilted_by(camera, measured), min(tilt, measured.spread)
+    by_feet = guessed and people is not None and measured is None
     inputs = LensInputs(segments, camera, stated, tilt, by_feet)
     lens = run.stage(find_lens, inputs, config.lens)
-    warnings = (*capture.warnings, *lens.warnings)
-    found = replace(capture, warnings=warnings, tilt=lens.tilt, heading=lens.heading)
+    warnings, tilted = (*capture.warnings, *lens.warnings), lens.tilt or measured
+    found = replace(capture, warnings=warnings, tilt=tilted, heading=lens.heading)
     if stated or lens.zoom != 1:
         found = replace(found, focal_spread=lens.spread)
     return through_lens(found, lens.zoom, pinned)

@@ -16,7 +16,7 @@ from mover.core.types import Bodies, Camera, Capture, Evidence, Room, Scene
 from mover.geometry.placement import place, standing_meshes
 from mover.geometry.volume import sample
 from mover.io.capture.pose_file import into_camera
-from mover.pipeline.estimates import lens_and_scale, odd_sizes, odd_statures
+from mover.pipeline.estimates import lens_and_scale, odd_sizes, odd_statures, tilt_by_feet
 from mover.pipeline.objects import Arrangement, Humans, Setup
 from mover.pipeline.people import Located, check_floor, estimate_people
 from mover.pipeline.presets import ROBUST
@@ -57,7 +57,7 @@ def _room(capture: Capture, people: Located | None, scene: Scene, **found: Any) 
         scene=scene, initial=capture.scene, kept=None if people is None else people.kept,
         covariance=None if people is None else people.alignment.covariance,
         path=capture.path if people is None else people.path,
-        estimates=_lens_and_scale(capture, scene.camera, people), **found,
+        estimates=_estimates(capture, scene.camera, people), **found,
     )  # fmt: skip
 
 
@@ -88,11 +88,15 @@ def furnished(
     )  # fmt: skip
 
 
-def _lens_and_scale(capture: Capture, camera: Camera, people: Located | None) -> tuple[str, ...]:
+def _estimates(capture: Capture, camera: Camera, people: Located | None) -> tuple[str, ...]:
     size = None if people is None else people.size
     if people is not None and capture.camera_height is not None:
         size = 0.0
-    return lens_and_scale(camera, capture.focal_spread, size)
+    found = lens_and_scale(camera, capture.focal_spread, size)
+    if people is None:
+        return found
+    spread = float(people.alignment.covariance.diag()[:2].amax()) ** 0.5
+    return (*found, tilt_by_feet(camera, spread))
 
 
 def _odd_people(people: Located, camera: Camera) -> tuple[str, ...]:
@@ -151,7 +155,7 @@ def warnings_of(capture: Capture) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """What a run would warn of besides the capture's own warnings, before it places anything.
 
     Returns:
-        Warnings, and lens and scale with their spreads (`Room.estimates`).
+        Warnings, and lens, scale and tilt with their spreads (`Room.estimates`).
 
     Raises:
         InputError: What it would refuse.
@@ -165,4 +169,4 @@ def warnings_of(capture: Capture) -> tuple[tuple[str, ...], tuple[str, ...]]:
         warnings += (*people.warnings, *_odd_people(people, camera))
     elif ground is not None:
         warnings += check_floor(ground, capture)
-    return warnings, _lens_and_scale(capture, camera, people)
+    return warnings, _estimates(capture, camera, people)

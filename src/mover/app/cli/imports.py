@@ -44,6 +44,11 @@ class ImportArgs:
     fov: Annotated[float, float_in(5, 175)] | None = None
     """Horizontal field of view, where there is no calibration: a guess, which `run` may mend
     [degrees]."""
+    tilt: tuple[float, ...] = ()
+    """Pitch (below 0: looks down), roll and, if not 1, how far off they may be, where a level or a
+    phone measured them (photos of an iPhone say it) [degrees]."""
+    camera_height: Annotated[float, float_in(0.1, 20)] | None = None
+    """Height of the camera above the floor, where it was measured [m]."""
     objects_masks: Path | None = None
     """Masks of the furniture in the reference image."""
     people_masks: Path | None = None
@@ -98,7 +103,7 @@ def _hints(args: ImportArgs, work: Path) -> "Hints":
     """What the options say; a camera of the folder counts where none is given."""
     from mover.io.capture.folder import folder_parts
     from mover.io.capture.parts import Hints, Parts
-    from mover.io.files.cameras import guessed_view, read_camera_file
+    from mover.io.files.cameras import camera_of_photo, guessed_view, read_camera_file
     from mover.io.files.images import image_size
 
     old = folder_parts(args.out) if args.out.is_dir() else Parts(name="")
@@ -110,6 +115,8 @@ def _hints(args: ImportArgs, work: Path) -> "Hints":
         if size is None:
             raise InputError("--fov: needs the size of the image, expected --image too")
         camera = guessed_view(args.fov, size)
+    elif camera is None and args.image is not None:
+        camera = camera_of_photo(args.image, size)
     if args.recording and args.recordings:
         raise InputError("--recording, --recordings: both are given, expected one of them")
     names = [item.partition("=") for item in args.names]
@@ -128,11 +135,17 @@ def _parts(args: ImportArgs, main: "Parts", hints: "Hints") -> "list[Parts]":
     import numpy as np
 
     from mover.io.capture.parts import Parts, image_parts
+    from mover.io.files.cameras import with_known
     from mover.io.files.npz import read_npz
 
-    lens, extra = main.camera or hints.camera, dict[str, Any]()
-    if args.camera is not None or args.fov is not None:
-        extra["camera"] = lens = hints.camera
+    given, extra = args.camera is not None or args.fov is not None, dict[str, Any]()
+    lens = hints.camera if given else main.camera or hints.camera
+    if lens is None and (args.tilt or args.camera_height is not None):
+        raise InputError("--tilt, --camera-height: there is no lens (--camera FILE, --fov DEGREES)")
+    if lens is not None:
+        own, lens = lens, with_known(lens, args.tilt, args.camera_height, args.image)
+        if given or lens.value != own.value or not (args.out / "camera.json").is_file():
+            extra["camera"] = lens
     if args.image is not None:
         extra["load_image"], extra["image_size"] = image_parts(args.image)
     if args.bodies is not None:

@@ -94,7 +94,7 @@ def layout_into(args: LayoutArgs, config: LayoutConfig) -> None:
     if args.depth is not None:
         take_depth(args.depth, args.capture)
     picture, people = read_picture_of(args.capture), args.capture / "bodies.npz"
-    guess = picture.camera
+    guess = picture
     with Bar() as bar:
         run = Run(args.capture / "perceived", bar)
         picture = seen_from(picture, read_bodies(people) if people.is_file() else None, run)
@@ -171,6 +171,11 @@ class VideoArgs:
     has the focal length."""
     fov: Annotated[float, float_in(5, 175)] | None = None
     """Horizontal field of view, where there is no calibration [degrees]."""
+    tilt: tuple[float, ...] = ()
+    """Pitch (below 0: looks down), roll and, if not 1, how far off they may be, where a level or a
+    phone measured them [degrees]."""
+    camera_height: Annotated[float, float_in(0.1, 20)] | None = None
+    """Height of the camera above the floor, where it was measured [m]."""
     depth: Path | None = None
     """Metric depth of the reference picture, for the first scene and the room."""
     meshes: Path | None = None
@@ -214,7 +219,8 @@ def video_to_room(
     capture, steps = args.out / "capture", chain.steps_in(args.out, say, STEPS)
     joints = None if chain.OUT in args.keypoints else Path(args.keypoints)
     files = (args.people_masks, args.objects, joints)
-    words = (repr(config), args.camera, args.fov, args.keypoints, args.objects_frame)
+    given = (args.camera, args.fov, args.tilt, args.camera_height)
+    words = (repr(config), *given, args.keypoints, args.objects_frame)
     stamp = str((str(source.resolve()), *stamp_of(source)))
     made_from = [stamp, *map(str, words), *("none" if file is None else file for file in files)]
     made = capture / "objects.json"
@@ -284,8 +290,9 @@ def _video(args: VideoArgs, capture: Path) -> "Video":
 
     given = None if args.keypoints in (NETWORK, MEDIAPIPE) else joints
     return Video(
-        args.source, args.camera, args.fov, given, "{frames}" in args.keypoints,
-        args.keypoints == MEDIAPIPE, args.people_masks, args.objects, args.objects_frame,
+        args.source, args.camera, args.fov, args.tilt, args.camera_height, given,
+        "{frames}" in args.keypoints, args.keypoints == MEDIAPIPE, args.people_masks, args.objects,
+        args.objects_frame,
     )  # fmt: skip
 
 
@@ -318,7 +325,8 @@ def _first_scene(capture: Path, args: VideoArgs, steps: chain.Steps) -> None:
     names = ("objects.json", "people.json", "bodies.npz")
     made_from = [*(capture / name for name in names), lens_in(capture)]
     own = find_depth_file(capture) if args.depth is None else (args.depth, True)
-    made_from += [str(args.meshes), *([] if own is None else [own[0]])]
+    made_from += [str(args.meshes), str((args.tilt, args.camera_height))]
+    made_from += [] if own is None else [own[0]]
     asked = LayoutArgs(capture, args.depth, args.meshes)
     made = capture / "scene.json"
     steps.do(STEPS[2], made_from, made, lambda: layout_into(asked, LayoutConfig()), yours=True)

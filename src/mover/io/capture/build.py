@@ -11,7 +11,7 @@ from mover.geometry.path import is_still
 from mover.geometry.rotations import rot_y
 from mover.io.capture.annotations_file import PeopleFile, detections_of, furniture_of, people_of
 from mover.io.capture.bodies_file import bodies_of, read_touch
-from mover.io.capture.camera_file import CameraFields, camera_of, path_of
+from mover.io.capture.camera_file import CameraFields, camera_of, measured_tilt, path_of
 from mover.io.capture.parts import Parts
 from mover.io.capture.plausible import check_plausible
 from mover.io.capture.pose_file import into_camera
@@ -33,9 +33,7 @@ def build_capture(parts: Parts) -> Capture:
     warn = warnings.append
     scene, turn = scene_of(parts.scene, parts.load_mesh, camera_of(parts.camera), warn)
     camera, lens = scene.camera, checked(parts.camera, CameraFields)
-    if (other := _lens(camera_of(parts.camera, camera))) != _lens(camera):
-        warn(f"scene.json: its camera counts ({_lens(camera)}), not camera.json ({other}); "
-             "give one in both")  # fmt: skip
+    _check_camera(parts.camera, camera, warn)
     detections = detections_of(parts.objects, camera, warn)
     _check_annotations(parts.scene, parts.objects.file, scene, detections, warn)
     none = PeopleFile(None, None, None)
@@ -66,9 +64,20 @@ def build_capture(parts: Parts) -> Capture:
         warnings=(), hypotheses=others, furniture=furniture, path=path,
         depth=None if parts.load_depth is None else parts.load_depth(camera),
         focal_spread=lens.focal_spread, focal_by_lines=lens.focal_by_lines,
+        tilt=measured_tilt(parts.camera),
     )  # fmt: skip
     check_plausible(capture, warn)
     return dataclasses.replace(capture, warnings=tuple(warnings))
+
+
+def _check_camera(at: At, camera: Camera, warn: Warn) -> None:
+    """Warn where scene.json has another camera; a measured tilt may be off from its estimate."""
+    other = camera_of(at, camera)
+    if measured_tilt(at) is not None:
+        other = dataclasses.replace(other, R_cam_world=camera.R_cam_world)
+    if _lens(other) != _lens(camera):
+        warn(f"scene.json: its camera counts ({_lens(camera)}), not camera.json "
+             f"({_lens(other)}); give one in both")  # fmt: skip
 
 
 def _lens(camera: Camera) -> str:

@@ -8,7 +8,7 @@ import torch
 from msgspec import Meta, Struct, to_builtins
 from numpy.typing import NDArray
 
-from mover.core.types import STILL, Bodies, Camera, CameraPath
+from mover.core.types import STILL, Bodies, Camera, CameraPath, Tilt
 from mover.geometry.camera import heading, pitch_roll
 from mover.geometry.rotations import affine, rot_y
 from mover.io.files.fields import LAST_INDEX, At, Warn, plain
@@ -24,8 +24,9 @@ LEVEL = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
 class CameraFields(Struct, frozen=True, omit_defaults=True):
     """camera.json, and `camera` of scene.json; lengths in pixels, the height above the floor [m].
 
-    The spread is the standard deviation of the logarithm of the focal length; `focal_by_lines`
-    says that the lines of the reference picture are in it, so that they do not count again.
+    The spread of the focal length is the standard deviation of its logarithm; `focal_by_lines`
+    says that the lines of the reference picture are in it, so that they do not count again. That
+    of the tilt [rad] says that pitch and roll were measured, and how well.
     """
 
     w: Side
@@ -38,6 +39,7 @@ class CameraFields(Struct, frozen=True, omit_defaults=True):
     height: Annotated[float, Meta(ge=0.1, le=20)] | None = None
     focal_spread: Share | None = None
     focal_by_lines: bool = False
+    tilt_spread: Annotated[float, Meta(ge=1e-4, le=0.5)] | None = None
 
 
 def camera_of(at: At, other: Camera | None = None) -> Camera:
@@ -61,6 +63,17 @@ def camera_of(at: At, other: Camera | None = None) -> Camera:
     else:
         turn = LEVEL if other is None else other.R_cam_world
     return Camera(K, turn, lens.w, lens.h)
+
+
+def measured_tilt(at: At) -> Tilt | None:
+    """The tilt of a JSON object that says how well it was measured; else None."""
+    spread = checked(at, CameraFields).tilt_spread
+    if spread is None:
+        return None
+    if at.maybe("R_cam_world") is None:
+        at.get("tilt_spread").refuse("'R_cam_world' beside it, which it is the spread of", "none")
+    pitch, roll = (float(angle) for angle in pitch_roll(camera_of(at).R_cam_world.double()))
+    return Tilt(pitch, roll, spread)
 
 
 def turned(camera: Camera) -> tuple[Camera, float]:

@@ -8,9 +8,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from mover.core.errors import InputError
 from mover.core.files import copy_whole
 from mover.core.types import Camera, Capture, DepthImage
+from mover.geometry.camera import tilted
 from mover.geometry.path import is_still
 from mover.io.capture.annotations_file import detections_to_json, image_name, people_to_json
 from mover.io.capture.bodies_file import write_bodies
@@ -170,6 +173,9 @@ def write_trees(
         capture.scene.camera, height=capture.camera_height, focal_spread=capture.focal_spread,
         focal_by_lines=capture.focal_by_lines,
     )  # fmt: skip
+    if (tilt := capture.tilt) is not None:
+        R = tilted(*torch.tensor([tilt.pitch, tilt.roll], dtype=torch.float64))
+        camera |= {"R_cam_world": R.tolist(), "tilt_spread": tilt.spread}
     write_scene(capture.scene, folder / "scene.json")
     objects = detections_to_json(capture.detections, capture.scene.camera, image)
     write_json(objects, folder / "objects.json")

@@ -20,7 +20,7 @@ from mover.io.capture import agreement as agree
 from mover.io.capture.annotations_file import detections_of, people_of
 from mover.io.capture.bodies_file import bodies_of, bodies_to_arrays, write_bodies
 from mover.io.capture.build import build_capture
-from mover.io.capture.camera_file import camera_of, turned
+from mover.io.capture.camera_file import camera_of, measured_tilt, turned
 from mover.io.capture.edits import carried, facing
 from mover.io.capture.folder import REFERENCE, folder_parts, read_capture, write_trees
 from mover.io.capture.parts import UNKNOWN, Parts
@@ -98,7 +98,8 @@ def with_parts(old: Parts, new: Parts) -> Parts:
               if (value := getattr(new, f.name)) is not None}  # fmt: skip
     camera = new.camera or old.camera
     if new.camera is not None and old.camera is not None:
-        kept = {k: v for k in ("R_cam_world", "height")
+        tilt = () if "R_cam_world" in new.camera.value else ("R_cam_world", "tilt_spread")
+        kept = {k: v for k in (*tilt, "height")
                 if (v := old.camera.value.get(k)) is not None}  # fmt: skip
         camera = At({**kept, **new.camera.value}, new.camera.file, new.camera.field)
     scene, lens = (old, old.camera) if new.scene is None else (new, new.camera or old.camera)
@@ -252,7 +253,8 @@ def _capture(whole: Parts) -> Capture | None:
             scene = Scene(replace(scene.camera, R_cam_world=new), None, objects)
     links = linked(scene, whole.objects)
     objects = (replace(p, annotation=links.get(p.id, p.annotation)) for p in scene.objects)
-    return replace(capture, scene=replace(scene, objects=tuple(objects)))
+    tilt = measured_tilt(whole.camera)
+    return replace(capture, scene=replace(scene, objects=tuple(objects)), tilt=tilt)
 
 
 def _check_apart(whole: Parts) -> Iterator[str]:

@@ -16,6 +16,7 @@ from mover.core.errors import InputError
 from mover.core.files import unreadable
 from mover.geometry.camera import tilted
 from mover.io.files.fields import LARGEST, At, read_json
+from mover.io.files.images import opened
 from mover.io.files.npz import read_npy, read_npz
 from mover.io.files.schema import Positive, Side, checked
 
@@ -24,7 +25,10 @@ log = logging.getLogger(__name__)
 LARGEST_TEXT = 1 << 20  # [bytes], of a calibration
 HALF = 0.5  # [px], calibrations count from the centre of the first pixel
 GUESSED = 0.055  # error of a focal length's logarithm by a network: 3-8 % (GeoCalib, WildCamera)
+BY_EXIF = 0.05  # the same of a photo, whose picture a video's frames may be a part of
+BY_GRAVITY = 1.0  # error of pitch and roll of a phone that is held still [degrees]
 WIDEST = 175.0  # [degrees], of a pinhole camera
+WIDEST_TILT = 0.5  # [rad], an error of the tilt that is as good as none
 STRAIGHT = 2.0  # [px], a lens that moves the corners by less is left as it is
 MATRIX = (
     "camera_mtx", "Intrinsics", "camera_matrix", "Camera_Matrix", "cameraMatrix",
@@ -65,7 +69,8 @@ def read_camera_file(path: Path, size: Size) -> At:
     Known are our own and nerfstudio's .json, 3 x 3 numbers in a text file (cam_K.txt), COLMAP's
     cameras.txt and cameras.bin or their folder, calibrations of OpenCV and ROS (.xml, .yml, .json),
     PROX's `camera_mtx` (whose fits leave out its distortion `k`), .json of RealSense and Open3D,
-    MoGe's fov.json, GeoCalib's {"f", "roll", "pitch"} and SAM 3D Body's focal_length.json.
+    MoGe's fov.json, GeoCalib's {"f", "roll", "pitch"}, SAM 3D Body's focal_length.json, and photos
+    whose EXIF has the focal length.
 
     Args:
         path: Of the file.
@@ -92,6 +97,11 @@ def read_camera_file(path: Path, size: Size) -> At:
             tree = read_npz(path).value if path.suffix == ".npz" else {"mtx": read_npy(path).value}
             tree = {key: np.asarray(value).tolist() for key, value in tree.items()}
             return camera_of_tree(At(tree, path.name), size)
+        case ".jpg" | ".jpeg" | ".png" | ".tif" | ".tiff" | ".webp":
+            if (photo := camera_of_photo(path, size)) is None:
+                cure = "expected one (or --fov DEGREES)"
+                raise InputError(f"{path.name}: has no focal length in its EXIF, {cure}")
+            return photo
         case _:
             if rows := _colmap_rows(path):
                 return _of_colmap(rows, path.name)
@@ -314,3 +324,108 @@ def _of_colmap(rows: list[list[str]], file: str) -> At:
     fx, fy, cx, cy, *bent = values[:1] * (model in ONE_FOCAL) + values
     K, size = _checked(np.array([fx, fy, cx, cy]), at), (int(w), int(h))
     return _of_matrix(K, size, At({"coeffs": bent}, file, model), shift=0.0)
+
+
+def with_known(
+    at: At, tilt: tuple[float, ...] = (), height: float | None = None, photo: Path | None = None
+) -> At:
+    """The fields of camera.json with what else is known of the camera.
+
+    Args:
+        at: The fields.
+        tilt: Pitch, roll and how far off they may be (1 if it is missing) [degrees], or nothing.
+        height: Of the camera above the floor [m].
+        photo: The reference image, whose EXIF may say the tilt where nothing else does.
+
+    Raises:
+        InputError: If the tilt has other numbers.
+    """
+    known: dict[str, Any] = {}
+    if tilt:
+        known = _tilt(tilt)
+    elif photo is not None and at.maybe("R_cam_world") is None:
+        known = tilt_of_photo(photo)
+    if height is not None:
+        known["height"] = height
+    return at.holding({**at.value, **known})
+
+
+def _tilt(degrees: tuple[float, ...]) -> dict[str, Any]:
+    """`R_cam_world` and `tilt_spread` of camera.json."""
+    numbers = (*degrees, BY_GRAVITY)[:3] if len(degrees) == 2 else degrees
+    bounds = zip(numbers, ((-89, 89), (-180, 180), (1e-3, 180)), strict=False)
+    if len(numbers) != 3 or not all(low <= n <= high for n, (low, high) in bounds):
+        raise InputError(
+            f"--tilt: has {' '.join(f'{n:g}' for n in degrees)}, expected pitch (below 0: looks"
+            f" down), roll and, if not {BY_GRAVITY:g}, how far off they may be [degrees]"
+        )
+    pitch, roll, off = (math.radians(angle) for angle in numbers)
+    R = tilted(*torch.tensor([pitch, roll], dtype=torch.float64))
+    return {"R_cam_world": R.tolist(), "tilt_spread": min(off, WIDEST_TILT)}
+
+
+# Photos: EXIF has the focal length as on 35 mm film, and Apple's maker note which way is down.
+
+FULL_FRAME = math.hypot(36, 24)  # [mm], diagonal to which "equivalent" focal lengths refer
+EXIF, FOCAL_35, LENS_NAME, MAKER_NOTE, ORIENTATION = 0x8769, 0xA405, 0xA434, 0x927C, 0x0112
+APPLE, ACCELERATION = b"Apple iOS\0", 8
+STEEPEST = 80.0  # [degrees]: nothing is level in a picture of the floor
+STILL = 0.1  # [g] by which a phone at rest may differ from 1
+SIDES_UP = {1: ((0, -1), (1, 0)), 3: ((0, 1), (-1, 0)), 6: ((1, 0), (0, 1)), 8: ((-1, 0), (0, -1))}
+"""Right and up of the upright picture in axes of the phone (right, top), by EXIF's orientation."""
+
+
+def camera_of_photo(path: Path, size: Size) -> At | None:
+    """The lens of a photo's EXIF in pictures of a size [px]; None: it has no focal length.
+
+    The 35 mm equivalent refers to the diagonal, so it holds for any format and either way up.
+
+    Raises:
+        InputError: If it is no picture.
+    """
+    with opened(path) as picture:
+        found: Any = picture.getexif().get_ifd(EXIF).get(FOCAL_35)
+    if found is None or not 1 <= float(found) <= 2000:
+        return None
+    focal = float(found) / FULL_FRAME * math.hypot(*(size or (0, 0)))
+    return with_spread(_lens(At({}, path.name), size, focal, focal), BY_EXIF)
+
+
+def tilt_of_photo(path: Path) -> dict[str, Any]:
+    """Fields of camera.json with the tilt, where an iPhone's photo says it; else none.
+
+    Tag 8 of Apple's maker note is the acceleration that the phone feels in units of g, whose
+    numbers are those of gravity along (right, top, out of the screen); see ExifTool's Apple.pm.
+
+    Raises:
+        InputError: If it is no picture.
+    """
+    with opened(path) as picture:
+        exif: Any = picture.getexif()
+        details, sides = exif.get_ifd(EXIF), SIDES_UP.get(exif.get(ORIENTATION, 1))
+    gravity = _acceleration(details.get(MAKER_NOTE))
+    if gravity is None or sides is None or "front" in str(details.get(LENS_NAME)):
+        return {}
+    (right, top), out = gravity[:2], gravity[2]
+    across, up = (x * right + y * top for x, y in sides)
+    angles = math.atan2(out, math.hypot(across, up)), math.atan2(across, -up)
+    pitch, roll = (math.degrees(angle) for angle in angles)
+    return {} if abs(pitch) > STEEPEST else _tilt((pitch, roll))
+
+
+def _acceleration(note: object) -> list[float] | None:
+    """The three numbers of Apple's maker note; None: it has none, or the phone moved."""
+    if not isinstance(note, bytes) or not note.startswith(APPLE):
+        return None
+    order = "<" if note[12:14] == b"II" else ">"
+    try:
+        (count,) = struct.unpack_from(order + "H", note, 14)
+        for k in range(count):
+            tag, kind, many, place = struct.unpack_from(order + "HHII", note, 16 + 12 * k)
+            if (tag, kind, many) == (ACCELERATION, 10, 3):
+                words = struct.unpack_from(order + "6i", note, place)
+                found = [a / b for a, b in zip(words[::2], words[1::2], strict=True)]
+                return found if abs(math.hypot(*found) - 1) < STILL else None
+    except (struct.error, ZeroDivisionError):
+        pass
+    return None

@@ -78,9 +78,10 @@ def read_image_file(at: At, path: Path, camera: Camera) -> Float[Tensor, "h w 3"
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of a picture as it is stored [px]."""
+    """Width and height of a picture as it is shown: upright, as its EXIF says [px]."""
     with opened(path) as picture:
-        return picture.size
+        sideways = picture.getexif().get(ORIENTATION, 1) >= 5
+        return picture.size[::-1] if sideways else picture.size
 
 
 def write_image(image: Float[Tensor, "h w 3"], path: Path) -> None:
@@ -95,6 +96,7 @@ def write_image(image: Float[Tensor, "h w 3"], path: Path) -> None:
 # Depth of the picture, as Depth Anything, MoGe, UniDepth, Depth Pro or MiDaS give it.
 
 
+ORIENTATION = 0x0112  # of EXIF: from 5 on the picture lies on its side
 DEPTH, DISPARITY = "depth", "disparity"
 NAMES = ("depth", "depth_metric", "metric_depth", "predicted_depth", "depths", "arr_0")
 FARTHEST = 100.0  # [m], what is farther is sky or nonsense
