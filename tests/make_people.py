@@ -487,8 +487,21 @@ def write_coco17_mmpose(folder: Path) -> Path:
     return folder / "mmpose.json"
 
 
+def write_coco17_ultralytics(folder: Path) -> Path:
+    """`to_json` of the results of each image, in a list."""
+    images: list[list[dict[str, object]]] = [[] for _ in range(int(FRAMES[-1]) + 1)]
+    for frame, row in zip(FRAMES, seen(COCO), strict=True):
+        joints = {axis: row[:, k].tolist() for k, axis in enumerate(("x", "y", "visible"))}
+        box = {"x1": 0.0, "y1": 0.0, "x2": 9.0, "y2": 9.0}
+        images[frame] = [{"name": "person", "class": 0, "confidence": 0.9, "box": box,
+                          "track_id": TRACK, "keypoints": joints}]  # fmt: skip
+    (folder / "yolo.json").write_text(json.dumps(images))
+    return folder / "yolo.json"
+
+
 KEYPOINTS = {
     "coco17": write_coco17, "coco17:mmpose": write_coco17_mmpose,
+    "coco17:ultralytics": write_coco17_ultralytics,
     "halpe26": partial(write_coco17, name="alphapose-results.json", joints=HALPE, score=2.9,
                        box=[0, 0, 1, 1], idx=TRACK),
     "openpose": write_openpose,

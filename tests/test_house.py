@@ -24,7 +24,7 @@ LINES = {
     "src/mover/fitting": 2_002,
     "src/mover/furniture": 945,
     "src/mover/geometry": 3_454,
-    "src/mover/io": 10_598,
+    "src/mover/io": 10_607,
     "src/mover/perceive": 2_796,
     "src/mover/pipeline": 1_259,
     "src/mover/stages": 6_121,

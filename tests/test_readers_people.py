@@ -647,8 +647,9 @@ def test_joints_with_nan_are_missing_and_another_number_of_them_is_refused(tmp_p
     found = keypoints_from("coco17", path)
     assert found.confidence[0, 5] == 0
     assert found.points.isfinite().all()
-    with pytest.raises(InputError, match=r"keypoints.*expected 26 joints"):
-        keypoints_from("halpe26", path)
+    for other in (path, made.write_coco17_ultralytics(tmp_path)):
+        with pytest.raises(InputError, match=r"keypoints.*expected 26 joints"):
+            keypoints_from("halpe26", other)
     openpose(tmp_path, 0, np.ones((18, 3)))
     with pytest.raises(InputError, match="expected 25 triples"):
         keypoints_from("openpose", tmp_path / "v_000000000000_keypoints.json")

@@ -1,11 +1,12 @@
 """2D joints: what detectors write, with tracks, and the file keypoints.npz.
 
-Lists of instances are COCO's results, AlphaPose's (Halpe) and MMPose's. OpenPose writes a file an
-image, with the body (BODY_25), and hands and face where detected.
+Lists of instances are COCO's results, AlphaPose's (Halpe), MMPose's and Ultralytics' (`to_json` of
+each image in a list). OpenPose writes a file an image, with the body (BODY_25), and hands and face
+where detected.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -93,7 +94,10 @@ def read_instances(path: Path, known: Known, layout: str) -> Keypoints:
     if not isinstance(at.value, dict | list):
         at.refuse("a list of instances, or an object with 'annotations' or 'instance_info'")
     images = None if isinstance(at.value, list) else at.maybe("instance_info")
-    if images is None:
+    if isinstance(at.value, list) and all(isinstance(image, list) for image in at.value):
+        images = at.items()  # of Ultralytics: a list an image
+        listed = [(one, at.holding(k)) for k, image in enumerate(images) for one in image.items()]
+    elif images is None:
         rows = at if isinstance(at.value, list) else need(at, "annotations", "instance_info")
         listed = [(one, need(one, "image_id", "frame_id", "frame")) for one in rows.items()]
     else:
@@ -114,7 +118,13 @@ def read_instances(path: Path, known: Known, layout: str) -> Keypoints:
 def _instance(at: At, frame: int, count: int) -> PersonJoints:
     """One person of a list."""
     given, scores = need(at, "keypoints"), at.maybe("keypoint_scores", "scores")
-    value = numbers(given)
+    if isinstance(given.value, Mapping):  # Ultralytics
+        axes = [numbers(need(given, axis)).reshape(-1) for axis in ("x", "y", "visible")]
+        if {len(axis) for axis in axes} != {count}:
+            given.refuse(f"{count} joints", f"{len(axes[0])}")
+        value = np.stack(axes, -1)
+    else:
+        value = numbers(given)
     width = value.size // count if value.size % count == 0 else 0
     if width not in (2, 3) or (value.ndim > 1 and value.shape[-1] != width):
         given.refuse(f"{count} joints of 2 or 3 numbers", f"shape {value.shape}")
