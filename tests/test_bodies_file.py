@@ -155,3 +155,10 @@ def test_parameters_of_world_bodies_turn_with_their_meshes(tmp_path):
     assert torch.allclose(found.verts, world.verts @ R.mT, atol=1e-6)
     again, _ = MODEL.posed(found.pose)
     assert torch.allclose(again, found.verts, atol=2e-5)
+
+
+def test_arrays_of_another_tool_are_named_with_what_reads_them(tmp_path):
+    np.savez(tmp_path / "romp.npz", results=np.zeros(3), joints3d=np.zeros(2))
+    said = r"romp\.npz: has 2 arrays \(results, joints3d\).*mover import-bodies TOOL"
+    with pytest.raises(InputError, match=said):
+        read_bodies(tmp_path / "romp.npz")

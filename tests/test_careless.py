@@ -212,3 +212,13 @@ def test_what_is_too_large_is_refused_at_once(folder: Path) -> None:
     tiny.change(folder / "camera.json", "h", 13_000)
     with pytest.raises(InputError, match=r"13000 x 13000, expected at most .* scale image"):
         read_capture(folder)
+
+
+def test_a_list_of_images_of_ultralytics_keeps_its_frames_and_tracks(tmp_path: Path) -> None:
+    (row,) = ROWS["ultralytics"]
+    first, second = ({**row, "name": "person", "track_id": track} for track in (4, 7))
+    (tmp_path / "people.json").write_text(json.dumps([[first], [], [first, second]]))
+    found = read_people(tmp_path / "people.json", {}, SIZE)
+    rows = [(item.frame, item.track, item.category) for item in found.items]
+    assert rows == [(0, 4, "person"), (2, 4, "person"), (2, 7, "person")]
+    assert len({item.mask for item in found.items}) == 1

@@ -15,7 +15,7 @@ from mover.bodies.corrected import has_mean_shape
 from mover.core.errors import InputError
 from mover.core.types import Bodies
 from mover.io.capture.pose_file import NEEDED, pose_of, posed, reproduces
-from mover.io.files.fields import FASTEST, SLOWEST, At, Warn
+from mover.io.files.fields import FASTEST, SLOWEST, At, Warn, listed
 from mover.io.files.looks import check_faces
 from mover.io.files.npz import AMASS, is_amass, read_npy, read_npz, write_npz
 from mover.io.formats import names
@@ -46,6 +46,11 @@ def bodies_of(at: At, warn: Warn) -> Bodies:
     """The bodies of named arrays: meshes where they are given, else the posed model."""
     if is_amass(at):
         raise InputError(f"{at.file}: is {AMASS}; expected bodies.npz")
+    if not {"frame", "person", "vertices", "body_pose"} & {*at.value}:
+        raise InputError(
+            f"{at.file}: has {listed('array', [*at.value])}, expected those of bodies.npz; if"
+            " another tool wrote it, name that (mover import-bodies TOOL, or --bodies-from TOOL)"
+        )
     frame = torch.from_numpy(at.get("frame").indices("B"))
     person = torch.from_numpy(at.get("person").indices(len(frame)))
     _check_rows(at, frame, person)

@@ -317,6 +317,9 @@ def list_instances(at: At, names: Names, size: Size | None) -> Instances:
     An item has `class` (a name) or `category_id`; `bbox` and `segmentation` or `mask`. COCO's ids
     have gaps; a file whose ids only make sense counted from 0 is read so. Frames are image_ids.
     """
+    if at.value and all(isinstance(image, list) for image in at.value):  # a list an image
+        images = enumerate(at.items())
+        at = at.holding([{**one.mapping(), "image_id": k} for k, i in images for one in i.items()])
     if any(isinstance(row, dict) and "box" in row for row in at.value):
         at = _of_ultralytics(at)
     rows = [(item, checked(item, RowFields)) for item in at.items()]
@@ -344,7 +347,8 @@ def _of_ultralytics(at: At) -> At:
         box, outline = row.get("box"), row.maybe("segments")
         corners = [box.get(key).number() for key in ("x1", "y1", "x2", "y2")]
         new: dict[str, Any] = {"class": row.get("name").text(), "bbox": corners}
-        new |= {"score": row.value.get("confidence"), "track_id": row.value.get("track_id")}
+        new |= {"score": row.value.get("confidence")}
+        new |= {key: row.value.get(key) for key in ("track_id", "image_id")}
         if outline is not None:
             x, y = (outline.get(axis).items() for axis in "xy")
             new["segmentation"] = [[v.value for pair in zip(x, y, strict=False) for v in pair]]

@@ -361,8 +361,9 @@ def smplifyx(path: Path, known: Known) -> Iterator[Person]:
 def amass(path: Path, _: Known) -> Iterator[Person]:
     """Motions of AMASS: one npz a person."""
     for track, file in enumerate(v.files_of(path, "motions of AMASS", "*.npz")):
-        at = v.with_fields(v.read_any(file), turn=Y_UP)
+        at = v.read_any(file)
         count = len(v.stacked(need(at, "trans"), 3))
+        at = v.with_fields(at, turn=Y_UP)
         if at.maybe("poses") is None and at.maybe("pose_body") is not None:
             given = [(at.maybe(name), width) for name, width in AMASS_PARTS.items()]
             rows = [np.zeros((count, n)) if x is None else v.rows(x, count, n) for x, n in given]
