@@ -171,7 +171,7 @@ class VideoArgs:
     has the focal length."""
     fov: Annotated[float, float_in(5, 175)] | None = None
     """Horizontal field of view, where there is no calibration [degrees]."""
-    tilt: tuple[float, ...] = ()
+    tilt: tuple[Annotated[float, float_in(-180, 180)], ...] = ()
     """Pitch (below 0: looks down), roll and, if not 1, how far off they may be, where a level or a
     phone measured them [degrees]."""
     camera_height: Annotated[float, float_in(0.1, 20)] | None = None
