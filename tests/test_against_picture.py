@@ -8,8 +8,8 @@ import pytest
 import torch
 from little_room import room, walkers
 
-from mover.core.types import Bodies, Capture, Detection, Masks, People
-from mover.geometry.camera import to_camera
+from mover.core.types import Bodies, Capture, Detection, Masks, People, Tilt
+from mover.geometry.camera import pitch_roll, tilted, to_camera
 from mover.geometry.rle import encode
 from mover.io.capture.agreement import (
     agreement,
@@ -77,6 +77,17 @@ def test_a_fault_is_named_and_mended(right, name):
     mended = agreement(thinned_capture(harmed))
     assert float(mended.objects.mean()) > 0.9
     assert float(mended.people.nanmean()) > 0.9
+
+
+@pytest.mark.parametrize("name", ["the camera upside down", "positions with y down"])
+def test_a_mended_camera_takes_its_measured_tilt_along(right, name):
+    harmed = FAULTS[name][1](right)
+    angles = [float(a) for a in pitch_roll(harmed.scene.camera.R_cam_world)]
+    mended = replace(harmed, tilt=Tilt(*angles, 0.02))
+    for fault in check_against_picture(mended).faults:
+        mended = fault.mend(mended)
+    R = tilted(torch.tensor(mended.tilt.pitch), torch.tensor(mended.tilt.roll))
+    assert torch.allclose(R, mended.scene.camera.R_cam_world, atol=1e-5)
 
 
 def test_parts_of_different_pictures_and_nothing_to_compare_are_said(right):

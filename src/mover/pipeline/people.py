@@ -71,10 +71,11 @@ def through_its_lens(
         camera = replace(camera, R_cam_world=people.alignment.camera.R_cam_world)
         spread = people.alignment.covariance.diag()[:2].amax()
         tilt = min(tilt, math.hypot(config.lens.feet, float(spread) ** 0.5))
-    if measured is not None:
-        camera, tilt = tilted_by(camera, measured), min(tilt, measured.spread)
-    by_feet = guessed and people is not None and measured is None
-    inputs = LensInputs(segments, camera, stated, tilt, by_feet)
+    elif measured is not None:
+        camera = tilted_by(camera, measured)
+    known = math.inf if measured is None else measured.spread
+    by_feet = guessed and people is not None and tilt < known
+    inputs = LensInputs(segments, camera, stated, min(tilt, known), by_feet)
     lens = run.stage(find_lens, inputs, config.lens)
     warnings, tilted = (*capture.warnings, *lens.warnings), lens.tilt or measured
     found = replace(capture, warnings=warnings, tilt=tilted, heading=lens.heading)

@@ -204,6 +204,7 @@ def _segment(
     return replace(
         capture, scene=replace(room.scene, objects=objects), camera_height=-room.scene.ground,
         bodies=bodies, people=people, touch=None, hypotheses=(), furniture=None, warnings=(),
+        tilt=None,
     )  # fmt: skip
 
 

@@ -83,7 +83,10 @@ def tilt(sign: float, roll: float, capture: Capture) -> Capture:
     """The pitch of the other sign, and a further roll."""
     camera = capture.scene.camera
     pitch, old = pitch_roll(camera.R_cam_world)
-    return seen_by(replace(camera, R_cam_world=tilted(sign * pitch, old + roll)), capture)
+    mended = seen_by(replace(camera, R_cam_world=tilted(sign * pitch, old + roll)), capture)
+    if (known := capture.tilt) is None:
+        return mended
+    return replace(mended, tilt=replace(known, pitch=sign * known.pitch, roll=known.roll + roll))
 
 
 def head_up(capture: Capture) -> Capture:
