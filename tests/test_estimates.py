@@ -17,7 +17,7 @@ from mover.pipeline.estimates import (
     odd_sizes,
     odd_statures,
     poor_fits,
-    tilt_by_feet,
+    tilt_of_camera,
 )
 
 CAMERA = little_room.camera()  # 400 px, 640 px wide: 77 degrees
@@ -88,7 +88,7 @@ def test_a_fit_that_misses_by_more_than_a_fortieth_of_the_height_is_named():
 
 def test_a_tilt_that_feet_leave_open_is_named_with_what_would_narrow_it():
     tilted_camera = replace(CAMERA, R_cam_world=tilted(torch.tensor(-0.2), torch.tensor(0.01)))
-    vague, sure = (tilt_by_feet(tilted_camera, math.radians(s)) for s in (1.9, 0.3))
-    assert sure == "camera: pitch -11.5°, roll 0.6°, by the feet ± 0.3°"
-    assert vague.startswith("camera: pitch -11.5°, roll 0.6°, by the feet ± 1.9°; ")
+    vague, sure = (tilt_of_camera(tilted_camera, math.radians(s)) for s in (1.9, 0.3))
+    assert sure == "camera: pitch -11.5°, roll 0.6°, ± 0.3° before the furniture"
+    assert vague.startswith("camera: pitch -11.5°, roll 0.6°, ± 1.9° before the furniture; ")
     assert "--tilt" in vague

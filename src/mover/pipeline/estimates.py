@@ -47,15 +47,15 @@ def lens_and_scale(camera: Camera, lens: float | None, size: float | None) -> tu
     return text, scale
 
 
-def tilt_by_feet(camera: Camera, spread: float) -> str:
+def tilt_of_camera(camera: Camera, spread: float) -> str:
     """Pitch and roll of a room's camera, and what would narrow them.
 
-    `spread` is the larger standard deviation [rad] by the feet and what was measured.
+    `spread` is the larger standard deviation [rad] by the feet and what else was known.
     """
     pitch, roll, off = (
         math.degrees(float(angle)) for angle in (*pitch_roll(camera.R_cam_world), spread)
     )
-    text = f"camera: pitch {pitch:.1f}°, roll {roll:.1f}°, by the feet ± {off:.1f}°"
+    text = f"camera: pitch {pitch:.1f}°, roll {roll:.1f}°, ± {off:.1f}° before the furniture"
     if spread > TILTED:
         text += "; a measured tilt (mover import --tilt) would narrow it"
     return text

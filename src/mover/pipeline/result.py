@@ -16,7 +16,7 @@ from mover.core.types import Bodies, Camera, Capture, Evidence, Room, Scene
 from mover.geometry.placement import place, standing_meshes
 from mover.geometry.volume import sample
 from mover.io.capture.pose_file import into_camera
-from mover.pipeline.estimates import lens_and_scale, odd_sizes, odd_statures, tilt_by_feet
+from mover.pipeline.estimates import lens_and_scale, odd_sizes, odd_statures, tilt_of_camera
 from mover.pipeline.objects import Arrangement, Humans, Setup
 from mover.pipeline.people import Located, check_floor, estimate_people
 from mover.pipeline.presets import ROBUST
@@ -96,7 +96,7 @@ def _estimates(capture: Capture, camera: Camera, people: Located | None) -> tupl
     if people is None:
         return found
     spread = float(people.alignment.covariance.diag()[:2].amax()) ** 0.5
-    return (*found, tilt_by_feet(camera, spread))
+    return (*found, tilt_of_camera(camera, spread))
 
 
 def _odd_people(people: Located, camera: Camera) -> tuple[str, ...]:

@@ -40,6 +40,7 @@ SIZE_PRIOR = 0.1  # [m], offset of people of a wrong size from the floor of a kn
 LEVEL = math.radians(8), math.radians(2)  # [rad], pitch and roll on shelves and tripods
 UNKNOWN_HEIGHT = 1.5  # [m], of a camera about which nothing is known
 LOOSE_TILT, LOOSE_GROUND = math.radians(1.0), 0.03  # [rad], [m], spreads that deserve a warning
+ODD = 2.5  # standard deviations of the tilt that was known, from which there is a warning
 NARROW = 0.3  # [m], a walk that is less wide is a line
 LARGE_OFFSET = 0.05  # [m], a body that floats that much has a wrong depth or size
 
@@ -331,7 +332,8 @@ def align_camera(
         offsets=dict(zip(people, at[3:].tolist(), strict=True)),
         warnings=(),
     )
-    warnings = (*_weak(found, votes), *_surprising(found, first, config))
+    known = inputs.tilt_spread or config.tilt_prior
+    warnings = (*_weak(found, votes), *_surprising(found, first, known))
     return dataclasses.replace(found, warnings=warnings)
 
 
@@ -431,14 +433,15 @@ def _cause(found: Alignment, votes: Votes) -> str:
     return "the feet say little about the camera"
 
 
-def _surprising(
-    found: Alignment, first: Float[Tensor, "2"], config: AlignConfig
-) -> tuple[str, ...]:
-    """Warnings about what contradicts the prior."""
+def _surprising(found: Alignment, first: Float[Tensor, "2"], known: float) -> tuple[str, ...]:
+    """Warnings about what contradicts the prior, a tilt that is known so well [rad]."""
     warnings: list[str] = []
     turned = float(torch.stack(pitch_roll(found.camera.R_cam_world.double())).sub(first).norm())
-    if turned > 2.5 * config.tilt_prior:
-        warnings.append(f"the feet turn the camera by {math.degrees(turned):.0f} degrees")
+    if turned > ODD * known:
+        warnings.append(
+            f"the feet turn the camera by {math.degrees(turned):.1f} degrees, from a tilt that was"
+            f" known to {math.degrees(known):.1f}"
+        )
     for person, offset in found.offsets.items():
         if abs(offset) > LARGE_OFFSET:
             side = "above" if offset > 0 else "below"
