@@ -17,7 +17,7 @@ from mover.app.results import write_truth
 from mover.core.types import Capture
 from mover.io.capture.bodies_file import write_bodies
 from mover.io.capture.camera_file import camera_to_json
-from mover.io.capture.edits import Place, placement_of, write_edits
+from mover.io.capture.edits import placement_of, write_edits
 from mover.io.capture.folder import write_capture
 from mover.io.files.fields import write_json
 from mover.io.people.keypoints import write_keypoints
@@ -34,7 +34,7 @@ def write_captures(desk: Path, room: KnownRoom, capture: Capture) -> None:
     (desk / "list.txt").write_text("captures/one  # a remark\n")
     piece = capture.scene.objects[0]
     moved = dataclasses.replace(piece, t_world_object=piece.t_world_object + 0.1)
-    write_edits((Place(piece.id, placement_of(moved, capture.scene)),), desk / "edits.json")
+    write_edits((placement_of(moved, capture.scene),), desk / "edits.json")
 
 
 def write_scenes(desk: Path, room: KnownRoom) -> None:
