@@ -27,7 +27,7 @@ LINES = {
     "src/mover/io": 10_621,
     "src/mover/perceive": 2_796,
     "src/mover/pipeline": 1_260,
-    "src/mover/stages": 6_121,
+    "src/mover/stages": 6_124,
     "bench": 7_468,
     "benchmarks": 1_170,
     "tests": 29_689,
