@@ -412,5 +412,8 @@ def test_a_photo_without_gravity_says_nothing(note, tmp_path):
     Image.new("RGB", (3, 2)).save(tmp_path / "bare.png")
     assert tilt_of_photo(tmp_path / "bare.png") == {}
     assert camera_of_photo(tmp_path / "bare.png", (3, 2)) is None
+    for orientation in (1, 3, 8):  # pixels that were turned since then
+        turned = photo(tmp_path / "t.jpg", apple_note((0.0, -1.0, 0.0)), orientation)
+        assert tilt_of_photo(turned) == {}
     front = photo(tmp_path / "f.jpg", apple_note((0.0, -1.0, 0.0)), 6, "front camera")
     assert tilt_of_photo(front) == {}

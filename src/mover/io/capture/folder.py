@@ -8,12 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from mover.core.errors import InputError
 from mover.core.files import copy_whole
 from mover.core.types import Camera, Capture, DepthImage
-from mover.geometry.camera import tilted
 from mover.geometry.path import is_still
 from mover.io.capture.annotations_file import detections_to_json, image_name, people_to_json
 from mover.io.capture.bodies_file import write_bodies
@@ -22,6 +19,7 @@ from mover.io.capture.camera_file import camera_to_json, path_to_arrays
 from mover.io.capture.parts import Hints, Parts, image_parts
 from mover.io.capture.scene_file import HYPOTHESES, write_hypotheses, write_scene
 from mover.io.files import images
+from mover.io.files.cameras import tilt_fields
 from mover.io.files.fields import At, read_json, write_json
 from mover.io.files.meshes import read_mesh
 from mover.io.files.npz import read_npz, write_npz
@@ -173,9 +171,8 @@ def write_trees(
         capture.scene.camera, height=capture.camera_height, focal_spread=capture.focal_spread,
         focal_by_lines=capture.focal_by_lines,
     )  # fmt: skip
-    if (tilt := capture.tilt) is not None:
-        R = tilted(*torch.tensor([tilt.pitch, tilt.roll], dtype=torch.float64))
-        camera |= {"R_cam_world": R.tolist(), "tilt_spread": tilt.spread}
+    if capture.tilt is not None:
+        camera |= tilt_fields(capture.tilt)
     write_scene(capture.scene, folder / "scene.json")
     objects = detections_to_json(capture.detections, capture.scene.camera, image)
     write_json(objects, folder / "objects.json")

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from mover.core.errors import InputError
 from mover.core.files import unreadable
+from mover.core.types import Tilt
 from mover.geometry.camera import tilted
 from mover.io.files.fields import LARGEST, At, read_json
-from mover.io.files.images import opened
+from mover.io.files.images import ORIENTATION, opened
 from mover.io.files.npz import read_npy, read_npz
 from mover.io.files.schema import Positive, Side, checked
 
@@ -351,7 +352,7 @@ def with_known(
 
 
 def _tilt(degrees: tuple[float, ...]) -> dict[str, Any]:
-    """`R_cam_world` and `tilt_spread` of camera.json."""
+    """The fields of a tilt that a user gives."""
     numbers = (*degrees, BY_GRAVITY)[:3] if len(degrees) == 2 else degrees
     bounds = zip(numbers, ((-89, 89), (-180, 180), (1e-3, 180)), strict=False)
     if len(numbers) != 3 or not all(low <= n <= high for n, (low, high) in bounds):
@@ -360,16 +361,22 @@ def _tilt(degrees: tuple[float, ...]) -> dict[str, Any]:
             f" down), roll and, if not {BY_GRAVITY:g}, how far off they may be [degrees]"
         )
     pitch, roll, off = (math.radians(angle) for angle in numbers)
-    R = tilted(*torch.tensor([pitch, roll], dtype=torch.float64))
-    return {"R_cam_world": R.tolist(), "tilt_spread": min(off, WIDEST_TILT)}
+    return tilt_fields(Tilt(pitch, roll, min(off, WIDEST_TILT)))
+
+
+def tilt_fields(tilt: Tilt) -> dict[str, Any]:
+    """`R_cam_world` and `tilt_spread` of camera.json."""
+    R = tilted(*torch.tensor([tilt.pitch, tilt.roll], dtype=torch.float64))
+    return {"R_cam_world": R.tolist(), "tilt_spread": tilt.spread}
 
 
 # Photos: EXIF has the focal length as on 35 mm film, and Apple's maker note which way is down.
 
 FULL_FRAME = math.hypot(36, 24)  # [mm], diagonal to which "equivalent" focal lengths refer
-EXIF, FOCAL_35, LENS_NAME, MAKER_NOTE, ORIENTATION = 0x8769, 0xA405, 0xA434, 0x927C, 0x0112
+EXIF, FOCAL_35, LENS_NAME, MAKER_NOTE = 0x8769, 0xA405, 0xA434, 0x927C
 APPLE, ACCELERATION = b"Apple iOS\0", 8
 STEEPEST = 80.0  # [degrees]: nothing is level in a picture of the floor
+SIDEWAYS = 45.0  # [degrees] of roll: the picture was turned since, without its maker note
 STILL = 0.1  # [g] by which a phone at rest may differ from 1
 SIDES_UP = {1: ((0, -1), (1, 0)), 3: ((0, 1), (-1, 0)), 6: ((1, 0), (0, 1)), 8: ((-1, 0), (0, -1))}
 """Right and up of the upright picture in axes of the phone (right, top), by EXIF's orientation."""
@@ -410,7 +417,8 @@ def tilt_of_photo(path: Path) -> dict[str, Any]:
     across, up = (x * right + y * top for x, y in sides)
     angles = math.atan2(out, math.hypot(across, up)), math.atan2(across, -up)
     pitch, roll = (math.degrees(angle) for angle in angles)
-    return {} if abs(pitch) > STEEPEST else _tilt((pitch, roll))
+    level = abs(pitch) <= STEEPEST and abs(roll) <= SIDEWAYS
+    return _tilt((pitch, roll)) if level else {}
 
 
 def _acceleration(note: object) -> list[float] | None:

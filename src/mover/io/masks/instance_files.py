@@ -347,8 +347,8 @@ def _of_ultralytics(at: At) -> At:
         box, outline = row.get("box"), row.maybe("segments")
         corners = [box.get(key).number() for key in ("x1", "y1", "x2", "y2")]
         new: dict[str, Any] = {"class": row.get("name").text(), "bbox": corners}
-        new |= {"score": row.value.get("confidence")}
-        new |= {key: row.value.get(key) for key in ("track_id", "image_id")}
+        keys = {"score": "confidence", "track_id": "track_id", "image_id": "image_id"}
+        new |= {ours: row.value.get(theirs) for ours, theirs in keys.items()}
         if outline is not None:
             x, y = (outline.get(axis).items() for axis in "xy")
             new["segmentation"] = [[v.value for pair in zip(x, y, strict=False) for v in pair]]
