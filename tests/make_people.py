@@ -499,9 +499,19 @@ def write_coco17_ultralytics(folder: Path) -> Path:
     return folder / "yolo.json"
 
 
+def write_coco17_vitpose(folder: Path) -> Path:
+    """`--save-json` of JunkyByte/easy_ViTPose, inference.py: y, x, score by track and image."""
+    images: list[dict[str, object]] = [{} for _ in range(int(FRAMES[-1]) + 1)]
+    for frame, row in zip(FRAMES, seen(COCO), strict=True):
+        images[frame] = {str(TRACK): row[:, [1, 0, 2]].tolist()}
+    names = {str(k): str(k) for k in range(17)}
+    (folder / "vitpose.json").write_text(json.dumps({"keypoints": images, "skeleton": names}))
+    return folder / "vitpose.json"
+
+
 KEYPOINTS = {
     "coco17": write_coco17, "coco17:mmpose": write_coco17_mmpose,
-    "coco17:ultralytics": write_coco17_ultralytics,
+    "coco17:ultralytics": write_coco17_ultralytics, "coco17:vitpose": write_coco17_vitpose,
     "halpe26": partial(write_coco17, name="alphapose-results.json", joints=HALPE, score=2.9,
                        box=[0, 0, 1, 1], idx=TRACK),
     "openpose": write_openpose,

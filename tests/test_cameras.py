@@ -292,6 +292,16 @@ camera_matrix:
   data: [{NINE.replace(" ", ", ")}]
 distortion_model: plumb_bob
 """
+KALIBR = f"""cam0:
+  cam_overlaps: []
+  camera_model: pinhole
+  distortion_coeffs: [1.0e-05, 0.0, 0.0,
+    0.0]
+  distortion_model: radtan
+  intrinsics: [{FX}, {FY}, {CX}, {CY}]
+  resolution: [960, 540]
+  rostopic: /cam0/image_raw
+"""  # as ethz-asl/kalibr writes camchain.yaml
 XML = f"""<?xml version="1.0"?><opencv_storage><image_Width>960</image_Width>
 <image_Height>540</image_Height><Camera_Matrix type_id="opencv-matrix"><rows>3</rows><cols>3</cols>
 <dt>d</dt><data>{NINE}</data></Camera_Matrix></opencv_storage>"""
@@ -310,6 +320,7 @@ def saved(write: Any, *given: Any, **named: Any) -> bytes:
 
 LENSES: dict[str, tuple[str, str | bytes | dict[str, Any]]] = {
     "OpenCV's YAML": ("calib.yml", YAML), "ROS": ("head.yaml", ROS), "OpenCV's XML": ("c.xml", XML),
+    "Kalibr": ("camchain.yaml", KALIBR),
     "OpenCV's JSON": ("c.json", {**SIDES, "camera_matrix": {"data": np.ravel(K).tolist()}}),
     "a dump": ("d.json", {**SIDES, "mtx": K, "dist": [[0, 0, 0, 0, 0]]}),
     "RealSense": ("rs.json", REALSENSE),
@@ -341,6 +352,8 @@ def test_every_calibration_gives_the_same_lens(kind, tmp_path):
 POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n"
 NO_LENSES: dict[str, tuple[str, str | bytes | dict[str, Any], str]] = {
     "bent": ("c.yml", YAML.replace("1e-04", "-0.3"), "corners by .* undistort the images"),
+    "Kalibr's fisheye": ("c.yaml", KALIBR.replace("radtan", "equidistant"), "undistort the images"),
+    "Kalibr's two": ("c.yaml", KALIBR + KALIBR.replace("cam0", "cam1"), "has cam0 and cam1"),
     "a fisheye": ("cameras.txt", COLMAP.replace("PINHOLE", "OPENCV_FISHEYE") + " ", "expected 8"),
     "several": ("cameras.txt", COLMAP + COLMAP.replace("740.5", "800"), "2 cameras, expected one"),
     "cut off": ("cameras.bin", BINARY[:50], "cannot be read .it is damaged, cut off"),

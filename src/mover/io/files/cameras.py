@@ -38,7 +38,7 @@ MATRIX = (
 """Names of [fx 0 cx; 0 fy cy; 0 0 1] in files of PROX, OpenCV, ROS and Open3D, or of four."""
 BENT = (
     "Distortion", "distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs",
-    "dist_coeff", "dist", "coeffs",
+    "dist_coeff", "distortion_coeffs", "dist", "coeffs",
 )  # fmt: skip
 """Names of k1, k2, p1, p2, k3, ... of OpenCV."""
 SIDES = (
@@ -59,8 +59,10 @@ XML = (
     r"<(?P<a>\w+)[^<>]*>\s*(<(?!data)\w+>[^<]*</\w+>\s*){0,9}<data>(?P<data>[^<]*)"
     r"|<(?P<b>\w+)>(?P<one>[^<]+)</"
 )
-YAML = r"^(?P<a>\w+):((?!^\w).)*?data:\s*\[(?P<data>[^]]*)|^(?P<b>\w+):\s*\[?(?P<one>[^][\n]+)"
+YAML = r"^(?P<a>\w+):((?!^\w).)*?data:\s*\[(?P<data>[^]]*)|^ *(?P<b>\w+):\s*\[?(?P<one>[^][\n]+)"
 """Matrices with `data`, and numbers by themselves."""
+CURVED = r"^ *(camera|distortion)_model: *(omni|ds|eucm|equidistant|fov|fisheye|kannala)\w*"
+"""Lenses of Kalibr and ROS that are not straight."""
 Size = tuple[int, int] | None
 
 
@@ -68,10 +70,10 @@ def read_camera_file(path: Path, size: Size) -> At:
     """The camera of a file of any known kind, in the fields of camera.json.
 
     Known are our own and nerfstudio's .json, 3 x 3 numbers in a text file (cam_K.txt), COLMAP's
-    cameras.txt and cameras.bin or their folder, calibrations of OpenCV and ROS (.xml, .yml, .json),
-    PROX's `camera_mtx` (whose fits leave out its distortion `k`), .json of RealSense and Open3D,
-    MoGe's fov.json, GeoCalib's {"f", "roll", "pitch"}, SAM 3D Body's focal_length.json, and photos
-    whose EXIF has the focal length.
+    cameras.txt and cameras.bin or their folder, calibrations of OpenCV, ROS and Kalibr (.xml, .yml,
+    .json), PROX's `camera_mtx` (whose fits leave out its distortion `k`), .json of RealSense and
+    Open3D, MoGe's fov.json, GeoCalib's {"f", "roll", "pitch"}, SAM 3D Body's focal_length.json, and
+    photos whose EXIF has the focal length.
 
     Args:
         path: Of the file.
@@ -268,10 +270,15 @@ def _rows(path: Path) -> list[list[str]]:
 
 
 def _of_text(path: Path) -> At:
-    """The matrices and numbers of OpenCV's XML or YAML, or of ROS's YAML, by name."""
+    """The matrices and numbers of OpenCV's XML or YAML, or of ROS's or Kalibr's YAML, by name."""
     text, found = _text(path), dict[str, Any]()
     if "<!ENTITY" in text:
         raise InputError(f"{path.name}: has entities, expected OpenCV's XML")
+    if curved := re.search(CURVED, text, re.M):
+        cure = "a straight lens: undistort the images first"
+        raise InputError(f"{path.name}: has '{curved[0].strip()}', expected {cure}")
+    if len(cameras := re.findall(r"^cam\d+(?=:)", text, re.M)) > 1:
+        raise InputError(f"{path.name}: has {' and '.join(cameras)}, expected the one of the video")
     for match in re.finditer(XML if path.suffix.lower() == ".xml" else YAML, text, re.M | re.S):
         name, words = match["a"] or match["b"], (match["data"] or match["one"] or "").split()
         words = [word.strip(",") for word in words if word != ","]
@@ -282,6 +289,8 @@ def _of_text(path: Path) -> At:
                 At(" ".join(words), path.name, name).refuse("numbers")
     if not found:
         raise unreadable(path, "it has no numbers with names", "OpenCV's calibration")
+    if len(size := found.get("resolution", ())) == 2:  # of Kalibr
+        found |= {"width": size[:1], "height": size[1:]}
     return At(found, path.name)
 
 

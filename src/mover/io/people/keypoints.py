@@ -1,12 +1,12 @@
 """2D joints: what detectors write, with tracks, and the file keypoints.npz.
 
 Lists of instances are COCO's results, AlphaPose's (Halpe), MMPose's and Ultralytics' (`to_json` of
-each image in a list). OpenPose writes a file an image, with the body (BODY_25), and hands and face
-where detected.
+each image in a list); easy_ViTPose has people by track in a list of images. OpenPose writes a file
+an image, with the body (BODY_25), and hands and face where detected.
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -97,6 +97,12 @@ def read_instances(path: Path, known: Known, layout: str) -> Keypoints:
     if isinstance(at.value, list) and all(isinstance(image, list) for image in at.value):
         images = at.items()  # of Ultralytics: a list an image
         listed = [(one, at.holding(k)) for k, image in enumerate(images) for one in image.items()]
+    elif isinstance(at.value, dict) and at.maybe("skeleton") is not None:
+        listed = [
+            (one, at.holding(k))
+            for k, image in enumerate(need(at, "keypoints").items())
+            for one in _of_vitpose(image)
+        ]
     elif images is None:
         rows = at if isinstance(at.value, list) else need(at, "annotations", "instance_info")
         listed = [(one, need(one, "image_id", "frame_id", "frame")) for one in rows.items()]
@@ -113,6 +119,16 @@ def read_instances(path: Path, known: Known, layout: str) -> Keypoints:
             frame.refuse("a number, or a name with one")
         seen.append(_instance(one, int(number[-1]) - known.first, LAYOUTS[layout]))
     return keypoints_of(seen, layout, known.fps, path.name)
+
+
+def _of_vitpose(image: At) -> Iterator[At]:
+    """People of an image of easy_ViTPose's --save-json: rows y, x, score by their track."""
+    for track in image.mapping():
+        joints = numbers(image.get(track))
+        if joints.ndim != 2 or joints.shape[1] != 3 or not track.isdecimal():
+            image.get(track).refuse("rows y, x, score by the number of a person")
+        person = {"keypoints": joints[:, [1, 0, 2]].tolist(), "track_id": int(track)}
+        yield image.holding(person)
 
 
 def _instance(at: At, frame: int, count: int) -> PersonJoints:
