@@ -27,6 +27,7 @@ from mover_bench.experiment.job import room_named
 
 Change = Callable[[Capture], Capture | None]
 Z_UP = rot_x(torch.tensor(math.pi / 2))  # (x, y, z) of a y-up world in a z-up one: (x, -z, y)
+ROS = torch.tensor([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]])  # x forward, y left, z up
 HALF_TURN = rot_z(torch.tensor(math.pi))
 
 
@@ -40,9 +41,15 @@ def objects(change: Callable[[SceneObject], SceneObject]) -> Change:
     return changed
 
 
-def mesh(verts: Callable[[SceneObject], Tensor]) -> Change:
-    """Other vertices of the meshes."""
-    return objects(lambda one: replace(one, mesh=replace(one.mesh, verts=verts(one))))
+def mesh(verts: Callable[[SceneObject], Tensor], first: bool = False) -> Change:
+    """Other vertices of the meshes, or of that of the first object."""
+
+    def changed(capture: Capture) -> Capture:
+        some = [replace(one, mesh=replace(one.mesh, verts=verts(one))) if not (first and k) else one
+                for k, one in enumerate(capture.scene.objects)]  # fmt: skip
+        return replace(capture, scene=replace(capture.scene, objects=tuple(some)))
+
+    return changed
 
 
 def world(A: Tensor, sign: float = 1.0) -> Change:
@@ -185,6 +192,12 @@ FAULTS: dict[str, tuple[str, Change]] = {
     "masks of people inverted": ("inverted", people_inverted),
     "masks of furniture inverted": ("inverted", furniture_inverted),
     "meshes with +z up": ("side (+z is up)", mesh(lambda one: one.mesh.verts @ Z_UP.mT)),
+    "one mesh with +z up": ("is on the side", mesh(
+        lambda one: one.mesh.verts @ Z_UP.mT, first=True)),
+    "one placement applied twice": ("placed twice", mesh(
+        lambda one: place_object(one).verts, first=True)),
+    "positions with +z down": ("side (+z is down)", world(Z_UP.mT)),
+    "positions of ROS": ("x is forward", world(ROS)),
     "positions with +z up": ("side (+z is up)", world(Z_UP)),
     "whole scene with +z up": ("side (+z is up)", everything(Z_UP)),
     "positions with y down": ("upside down", world(diagonal(1, -1, 1))),

@@ -1,5 +1,6 @@
 """Scene, bodies and masks are held against each other, and what is wrong is named."""
 
+import json
 import runpy
 from dataclasses import replace
 from pathlib import Path
@@ -119,3 +120,30 @@ def test_a_mended_capture_is_written_beside_the_given_one(right, tmp_path):
     assert check_against_picture(found).warnings == ()
     with pytest.raises(Exception, match="there already"):
         write_mended(given, check_against_picture(given), tmp_path / "in", tmp_path / "out")
+    nobody = {"images": [], "annotations": [], "categories": []}
+    (tmp_path / "in" / "people.json").write_text(json.dumps(nobody))
+    given = read_capture(tmp_path / "in")
+    write_mended(given, check_against_picture(given), tmp_path / "in", tmp_path / "new")
+    assert read_capture(tmp_path / "new").people is None
+
+
+def test_a_mesh_on_its_side_does_not_lay_the_others_down(right):
+    """It gains more than two others lose: the mean alone would turn all three."""
+    few = replace(right, scene=replace(right.scene, objects=right.scene.objects[:3]))
+    harmed = FAULTS["one mesh with +z up"][1](few)
+    (fault,) = check_against_picture(harmed).faults
+    assert (
+        fault.name == f"scene.json: the mesh of {few.scene.objects[0].id} is on the side (+z is up)"
+    )
+    mended = fault.mend(harmed).scene.objects
+    assert all(a.mesh is b.mesh for a, b in zip(mended[1:], few.scene.objects[1:], strict=True))
+
+
+def test_no_cure_is_named_that_leads_to_where_nothing_is_seen(right):
+    """Objects all over the world: a unit may gain a little, and puts the room before the lens."""
+    away = torch.tensor([[3.0, -9.0, 8.0], [-5.0, 7.0, -30.0], [9.0, 2.0, 14.0]])
+    some = tuple(replace(one, t_world_object=at)
+                 for one, at in zip(right.scene.objects[:3], away, strict=True))  # fmt: skip
+    found = check_against_picture(replace(right, scene=replace(right.scene, objects=some)))
+    assert not found.faults
+    assert any("are scene, camera and picture of one room" in text for text in found.unexplained)

@@ -283,7 +283,7 @@ def _turned_to_camera(layout: Layout, inputs: PlaceInputs, config: LayoutConfig)
     along = torch.tensor([name in WALL_PIECES for name in objects.categories])
     away = facing(layout, torch.zeros(1, 3)) < 0
     turn = along & away & (then <= SAME[0] * now + SAME[1])
-    return replace(layout, yaw=torch.where(turn, other.yaw, layout.yaw))
+    return replace(layout, yaw=torch.where(turn, other.yaw, wrap(layout.yaw)))
 
 
 def _pieces(picture: Picture, chosen: list[tuple[int, ShapeChoice]]) -> tuple[SceneObject, ...]:

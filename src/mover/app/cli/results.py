@@ -67,7 +67,12 @@ def check(arguments: Sequence[str]) -> None:
     say("\n".join((*findings.summary, *estimates)))
     if args.mend is not None:
         write_mended(capture, findings, args.source, args.mend)
-        say(f"{args.mend}: wrote the capture without {len(findings.faults)} faults")
+        known = len(findings.faults)
+        say(
+            f"{args.mend}: wrote the capture without {known} {'fault' if known == 1 else 'faults'}"
+            if known
+            else f"{args.mend}: wrote the capture as it is, nothing to mend was found"
+        )
     say(f"{args.source} is a valid capture; its initial scene is drawn in {args.out}")
 
 

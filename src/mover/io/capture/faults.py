@@ -3,6 +3,7 @@
 A fault is a hypothesis: a capture with it agrees clearly better with itself once it is undone.
 """
 
+import functools
 import math
 import shutil
 from collections.abc import Iterator
@@ -22,12 +23,14 @@ from mover.geometry.placement import place_object
 from mover.geometry.rle import mask_boxes
 from mover.io.capture import agreement as agree
 from mover.io.capture import mends
-from mover.io.capture.folder import write_capture
+from mover.io.capture.folder import lacking, write_capture
 from mover.io.files.fields import listed
 
 MARGIN = 0.06  # a fault is named from this gain on: unharmed known rooms have none above 0.01
 FITTED_MARGIN = 0.12  # the same where numbers are fitted, which fit noise, too
 TIME_MARGIN = 0.02  # of times, which are sharp: unharmed rooms lose .03 by a frame
+ALONE = 0.4  # the same of one object: its own overlap
+WORSE = 0.1  # what a fault of all may cost the median object
 SAME = 0.01  # by so much better is a fault of frames one by one than a simpler one
 MOST_FAULTS = 3  # that are found one after the other
 MOST_SHIFT = 120  # frames
@@ -82,7 +85,17 @@ class Findings:
 def check_against_picture(capture: Capture) -> Findings:
     """Hold scene, bodies and masks of a capture against each other: all lie in one picture."""
     thin = agree.thinned_capture(capture)
-    own = found = agree.agreement(thin)
+    own = agree.agreement(thin)
+    faults, mended, found = _faults(thin, own)
+    if len(own.objects) and mean(found.objects) < POOR:  # no cure leads to where objects are seen
+        faults = [one for one in faults if not one.name.startswith(("scene.json", "camera.json"))]
+        mended = functools.reduce(lambda x, one: one.mend(x), faults, thin)
+        found = agree.agreement(mended)
+    return Findings(own, tuple(faults), tuple(_unexplained(mended, found)))
+
+
+def _faults(thin: Capture, found: agree.Agreement) -> tuple[list[Fault], Capture, agree.Agreement]:
+    """One fault after the other, the worst first, and the capture without them."""
     faults: list[Fault] = []
     while len(faults) < MOST_FAULTS:
         best, least = None, 0.0
@@ -98,7 +111,7 @@ def check_against_picture(capture: Capture) -> Findings:
             break
         fault, thin, found = best
         faults.append(fault)
-    return Findings(own, tuple(faults), tuple(_unexplained(thin, found)))
+    return faults, thin, found
 
 
 def write_mended(capture: Capture, findings: Findings, source: Path, folder: Path) -> None:
@@ -110,7 +123,8 @@ def write_mended(capture: Capture, findings: Findings, source: Path, folder: Pat
     if folder.exists():
         raise InputError(f"{folder}: is there already, expected a new folder for the capture")
     if (source / "scene.json").is_file():
-        shutil.copytree(source, folder)
+        none = lacking(capture)  # such as a people.json without people
+        shutil.copytree(source, folder, ignore=lambda _, names: none & {*names})
     for fault in findings.faults:
         capture = fault.mend(capture)
     write_capture(capture, folder)
@@ -123,10 +137,16 @@ def mean(score: Float[Tensor, " n"]) -> float:
 
 
 def _gain(own: agree.Agreement, other: agree.Agreement) -> float:
-    """By how much the scores of another capture are better; none where masks lose their bodies."""
+    """By how much the scores of another capture are better.
+
+    None where masks lose their bodies, or where few objects gain what most of them lose.
+    """
     before, after = (int((~one.people.isnan()).sum()) for one in (own, other))
+    same = own.objects.shape == other.objects.shape and len(own.objects)
+    lost = float((other.objects - own.objects).median()) if same else 0.0
     pairs = [(getattr(own, name), getattr(other, name)) for name in agree.SCORES]
-    return -1.0 if after < before / 2 else sum(mean(b) - mean(a) for a, b in pairs)
+    none = after < before / 2 or lost < -WORSE
+    return -1.0 if none else sum(mean(b) - mean(a) for a, b in pairs)
 
 
 def _unexplained(thin: Capture, found: agree.Agreement) -> Iterator[str]:
@@ -149,6 +169,8 @@ def _unexplained(thin: Capture, found: agree.Agreement) -> Iterator[str]:
 
 WORLDS = {
     "on the side (+z is up)": ("x z -y", 1, "+y must be up (import: --up z)"),
+    "on the side (+z is down)": ("x -z y", 1, "+y must be up"),
+    "that of ROS (x is forward, +z is up)": ("-y z -x", 1, "+y must be up, -z forward"),
     "upside down (+y is down)": ("x -y -z", -1, "+y must be up (import: --up=-y)"),
     "upside down (only y is turned)": ("x -y z", 1, "change the sign of y"),
     "behind the camera (+z is forward)": ("x y -z", -1, "the camera looks along -z"),
@@ -157,6 +179,7 @@ WORLDS = {
     "of another handedness (y and z are swapped)": ("x z y", -1, "exchange y and z"),
 }  # fmt: skip
 """Worlds in which a scene may be: its axes, the sign of yaw, and what helps."""
+TWICE = "they are in the world already: translation 0, yaw 0, scale 1"
 PEOPLE = {"mirrored": "-x y z", "flipped": "x -y z", "upside down": "-x -y z"}
 UP = "R_cam_world maps the world (+y up) to the camera (x right, y down, z forward)"
 
@@ -164,6 +187,7 @@ UP = "R_cam_world maps the world (+y up) to the camera (x right, y down, z forwa
 def hypotheses(capture: Capture, found: agree.Agreement) -> Iterator[Fault]:
     """All faults that a (thinned) capture may have; of equals, the first is meant."""
     yield from _worlds()
+    yield from _alone(capture, found)
     for unit, k in UNITS.items():
         cure, scale = f"multiply by {1 / k:.4g}", mends.scaled
         for what, by in (
@@ -209,8 +233,26 @@ def _worlds() -> Iterator[Fault]:
             if what != "the meshes are" or (A[1, 1] != 1 and A.det() > 0):
                 yield Fault(f"scene.json: {what} {name}", cure, partial(mends.each, change))
     twice = partial(mends.each, lambda one: mends.baked(one.mesh.verts, one))
-    cure = "they are in the world already: translation 0, yaw 0, scale 1"
-    yield Fault("scene.json: the meshes are placed twice", cure, twice)
+    yield Fault("scene.json: the meshes are placed twice", TWICE, twice)
+
+
+def _alone(capture: Capture, found: agree.Agreement) -> Iterator[Fault]:
+    """One object that is nearly nowhere to be seen: its mesh on the side, or placed twice."""
+    known, _ = agree.annotated(capture)
+    if len(known) < 2 or len(known) != len(found.objects):
+        return
+    one, margin = known[int(found.objects.argmin())], ALONE / len(known)
+    name, (rows, *_) = next(iter(WORLDS.items()))
+    for what, cure, change in (
+        (
+            f"the mesh of {one.id} is {name}",
+            "turn it: +y must be up",
+            partial(mends.remeshed, mends.axes(rows)),
+        ),
+        (f"the mesh of {one.id} is placed twice", TWICE, lambda x: mends.baked(x.mesh.verts, x)),
+    ):
+        own = partial(mends.each, lambda x, change=change: change(x) if x.id == one.id else x)
+        yield Fault(f"scene.json: {what}", cure, own, margin)
 
 
 # What is fitted: times, tracks, annotations and lenses.

@@ -115,6 +115,18 @@ def _if_there(read: Callable[[Path], At], path: Path) -> At | None:
     return read(path) if path.exists() or path.is_symlink() else None
 
 
+def lacking(capture: Capture) -> set[str]:
+    """The files and folders that a capture with all its parts would have, and this one has not."""
+    people, depth = capture.people or capture.reference_people, capture.depth
+    wanted = {
+        "bodies.npz": capture.bodies, "people.json": people, "contacts.npz": capture.touch,
+        FURNITURE: capture.furniture, "cameras.npz": None if is_still(capture.path) else True,
+        images.DEPTH: depth if depth is not None and depth.metric else None,
+        images.DISPARITY: depth if depth is not None and not depth.metric else None,
+    }  # fmt: skip
+    return {name for name, part in wanted.items() if part is None}
+
+
 def write_capture(capture: Capture, folder: Path) -> None:
     """Write a capture folder, without frames; reading it gives the same capture.
 
@@ -123,15 +135,9 @@ def write_capture(capture: Capture, folder: Path) -> None:
     Raises:
         ValueError: If the folder has a file that this capture lacks: the two would mix.
     """
-    people, depth = capture.people or capture.reference_people, capture.depth
-    wanted = {
-        "bodies.npz": capture.bodies, "people.json": people, "contacts.npz": capture.touch,
-        FURNITURE: capture.furniture, "cameras.npz": None if is_still(capture.path) else True,
-        images.DEPTH: depth if depth is not None and depth.metric else None,
-        images.DISPARITY: depth if depth is not None and not depth.metric else None,
-    }  # fmt: skip
-    for name, part in wanted.items():
-        if part is None and (folder / name).exists():
+    depth = capture.depth
+    for name in lacking(capture):
+        if (folder / name).exists():
             raise ValueError(f"{folder} has {name}, which the capture lacks; choose a new folder")
     if capture.reference is not None:
         images.write_image(capture.reference, folder / "reference.png")
