@@ -314,6 +314,23 @@ def test_tracks_of_slahmr_are_those_that_its_side_file_names(tmp_path):
     assert found.bodies.person.tolist() == [12] * 5
 
 
+def test_of_slahmrs_stages_the_last_one_counts_and_its_file_is_named(tmp_path):
+    """Names of slahmr/optim/optimizers.py (vye16/slahmr); numbers are iterations."""
+    with np.load(made.write_slahmr(tmp_path) / "video_000060_world_results.npz") as true:
+        arrays = dict(true)
+    (tmp_path / "video_000060_world_results.npz").unlink()
+    names = ("root_fit/v_000030", "smooth_fit/v_000060", "motion_chunks/v_20", "motion_chunks/v_3")
+    for off, name in zip((1, 2, 0, 3), names, strict=True):
+        file = tmp_path / f"{name}_world_results.npz"
+        file.parent.mkdir(exist_ok=True)
+        np.savez(file, **{**arrays, "trans": arrays["trans"] + off})
+    found = bodies_from("slahmr", tmp_path, KNOWN)
+    off = found.bodies.verts.mean(1).numpy() - made.person("smplh")["verts"].mean(1)
+    assert np.abs(off).max() < 2e-3
+    chosen = "of 4 results motion_chunks/v_20_world_results.npz is read"
+    assert f"{tmp_path.name}: {chosen}" in found.warnings
+
+
 def test_the_lens_follows_from_joints_where_the_focal_length_is_missing(tmp_path, faces):
     made.write_sam3dbody(tmp_path, focal=False)
     found = bodies_from("sam3dbody", tmp_path, Known(faces=faces))

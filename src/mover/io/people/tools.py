@@ -47,6 +47,7 @@ AMASS = {156: "smplh", 165: "smplx", 72: "smpl"}
 AMASS_PARTS = {"root_orient": 3, "pose_body": 63, "pose_jaw": 3, "pose_eye": 6, "pose_hand": 90}
 """What newer files have in its place, and the numbers of a row of each."""
 NO_CAMERA = "is a motion in a world of its own: where the camera saw the people is not known"
+STAGES = ("root_fit", "smpl_fit", "smooth_fit", "motion_fit", "motion_chunks")  # of SLAHMR
 Y_UP = np.array([[1, 0, 0, 0, 0, 1, 0, -1, 0]])  # AMASS has +z up
 
 
@@ -299,15 +300,18 @@ def phalp(path: Path, known: Known) -> Iterator[Person]:
 
 
 def slahmr(path: Path, _: Known) -> Iterator[Person]:
-    """The last *_world_results.npz of a folder: arrays of (people, frames, numbers).
+    """The highest *_world_results.npz of the last stage: arrays of (people, frames, numbers).
 
     track_info.json beside it gives the tracks and the frames in which a person is visible.
 
     Raises:
         InputError: If it is the prior's file, or another.
     """
-    path = v.files_of(path, "SLAHMR's results", "**/*_world_results.npz")[-1]
-    source = v.read_any(path)
+    stage = {name: rank for rank, name in enumerate(STAGES)}
+    files = v.files_of(path, "SLAHMR's results", "**/*_world_results.npz")
+    path = max(files, key=lambda f: (stage.get(f.parent.name, -1), v.natural(Path(f.name))))
+    chosen = f"of {len(files)} results {path.parent.name}/{path.name} is read"
+    notes, source = (chosen,) if len(files) > 1 else (), v.read_any(path)
     if "prior_results" in path.name and source.maybe("trans") is None:
         raise InputError(
             f"{path.name}: is SLAHMR's motion prior, without positions; expected the file "
@@ -327,7 +331,7 @@ def slahmr(path: Path, _: Known) -> Iterator[Person]:
         of_one = {name: values[who][frames] for name, values in fields.items()}
         at = At({**of_one, "betas": betas[who], "frames": frames}, source.file)
         R, t = v.stacked(at.get("cam_R"), 3, 3), v.stacked(at.get("cam_t"), 3)
-        yield Person(at, track, K=K, warnings=movement(R, t))
+        yield Person(at, track, K=K, warnings=notes + movement(R, t))
 
 
 def _visible(path: Path, count: int, people: int) -> Iterator[tuple[int, int, NDArray[np.int64]]]:
