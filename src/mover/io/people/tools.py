@@ -363,11 +363,14 @@ def smplifyx(path: Path, known: Known) -> Iterator[Person]:
 
 
 def amass(path: Path, _: Known) -> Iterator[Person]:
-    """Motions of AMASS: one npz a person."""
-    for track, file in enumerate(v.files_of(path, "motions of AMASS", "*.npz")):
+    """Motions of AMASS: one npz a person; ours say which, in which frames and which way is up."""
+    for rank, file in enumerate(v.files_of(path, "motions of AMASS", "*.npz")):
         at = v.read_any(file)
         count = len(v.stacked(need(at, "trans"), 3))
-        at = v.with_fields(at, turn=Y_UP)
+        person, up, frame = (at.maybe(name) for name in ("person", "up_axis", "frame"))
+        track = rank if person is None else int(v.one_number(person))
+        turn = Y_UP if up is None or v.lone(up) != "y" else np.eye(3).reshape(1, 9)
+        at = v.with_fields(at, turn=turn, frames=np.arange(count) if frame is None else frame.value)
         if at.maybe("poses") is None and at.maybe("pose_body") is not None:
             given = [(at.maybe(name), width) for name, width in AMASS_PARTS.items()]
             rows = [np.zeros((count, n)) if x is None else v.rows(x, count, n) for x, n in given]
@@ -421,7 +424,7 @@ TOOLS = {
     "4dhumans": HMR2,
     "amass": Tool(
         amass, "smplx", pose=("poses",), translation="trans", camera=("turn",),
-        rate=("mocap_frame_rate", "mocap_framerate"), space="world",
+        frames=("frames",), rate=("mocap_frame_rate", "mocap_framerate"), space="world",
     ),
     "gem": GVHMR,
     "gvhmr": GVHMR,
