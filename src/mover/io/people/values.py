@@ -3,7 +3,6 @@
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +14,8 @@ from torch import Tensor
 
 from mover.core.errors import InputError
 from mover.core.pickles import load_plain
-from mover.core.records import BROKEN
 from mover.io.files.fields import LARGEST, LAST_INDEX, At, existing, read_json
-from mover.io.files.npz import AMASS, is_amass, read_npz
+from mover.io.files.npz import AMASS, is_amass, read_npy, read_npz
 from mover.io.people.found import Known
 
 PICKLES = (".pkl", ".pickle", ".joblib", ".pt", ".pth")
@@ -40,8 +38,10 @@ def read_any(path: Path) -> At:
     if kind in TREES:
         return TREES[kind](path)
     if kind == ".npy":
-        with suppress(*BROKEN), path.open("rb") as file:  # else a pickled object
-            return At(np.load(file, allow_pickle=False), path.name)
+        with path.open("rb") as file:
+            plain = b"'|O'" not in file.readline(1000)  # of the header: a pickled object
+        if plain:
+            return read_npy(path)
     return At(load_plain(path), path.name)
 
 
