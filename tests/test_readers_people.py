@@ -554,6 +554,21 @@ def test_people_without_tracks_are_followed_by_position_not_by_rank(tool, tmp_pa
     assert any("no tracks, so people are followed" in warning for warning in found.warnings)
 
 
+@pytest.mark.parametrize("above", [True, False])
+def test_images_without_numbers_are_frames_by_rank_and_their_people_are_one_image(
+    above, tmp_path, caplog
+):
+    """SMPLify-X: results/<name of the image>/<person>.pkl."""
+    for name, people in (("bob", 1), ("anna sits", 2), ("room", 1)):
+        for k in range(people):
+            fit = made.fit(0, np.array([[2.0 * k, 0, 4.0]]))
+            made.store(fit, tmp_path / "results" / name / f"{k:03d}.pkl")
+    source = tmp_path if above else tmp_path / "results"
+    found = read("smplifyx", source).bodies
+    assert found.frame.tolist() == [0, 0, 1, 2]
+    assert "names without a number are frames by rank: anna sits = 0, bob = 1" in caplog.text
+
+
 ODD = {
     "upside down": (lambda d: d["pose"].__setitem__((slice(None), slice(0, 3)), [0.0, 0.3, 0.0]),
                     "people stand on their heads; turn the video by 180 degrees"),

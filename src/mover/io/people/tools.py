@@ -347,11 +347,13 @@ def _visible(path: Path, count: int, people: int) -> Iterator[tuple[int, int, ND
 
 def prox(path: Path, known: Known) -> Iterator[Person]:
     """results/<frame>/<person>.pkl or <frame>.pkl of SMPLify-X and PROX, or one such file."""
-    files = v.files_of(path, "fits", "**/*.pkl")
-    images = [
-        file.parent if re.fullmatch(r"\d{1,3}", file.stem) and re.search(r"\d", file.parent.name)
-        else file for file in files
-    ]  # fmt: skip
+    files, homes = v.files_of(path, "fits", "**/*.pkl"), (path, path / "results")
+
+    def image_of(file: Path) -> Path:
+        inside = file.parent not in homes or re.search(r"\d", file.parent.name)
+        return file.parent if inside and re.fullmatch(r"\d{1,3}", file.stem) else file
+
+    images = [image_of(file) for file in files]
     for file, frame in zip(files, v.frames_in(images, path, known), strict=True):
         yield Person(v.read_any(file), None, frame)
 
