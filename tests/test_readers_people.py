@@ -337,6 +337,25 @@ def test_the_lens_follows_from_joints_where_the_focal_length_is_missing(tmp_path
     assert np.allclose(found.K, made.lens(1400), atol=0.5)
 
 
+@pytest.mark.parametrize("tool", ["prompthmr", "tram", "gvhmr"])
+def test_a_lens_that_the_files_lack_is_said_and_given_by_its_focal_length(tool, tmp_path):
+    path = made.BODIES[tool](tmp_path)
+    whole = bodies_from(tool, path, KNOWN)
+    if tool == "tram":
+        (path / "camera.npy").unlink()
+    else:
+        tree = load(path)
+        del tree["camera" if tool == "prompthmr" else "K_fullimg"]
+        tree.pop("camera_world", None)
+        dump(tree, path)
+    found = bodies_from(tool, path, KNOWN)
+    assert any("no lens, so the true one is taken" in text for text in found.warnings)
+    assert (found.bodies.verts - whole.bodies.verts).abs().max() > 0.1
+    again = bodies_from(tool, path, replace(KNOWN, focal=CASES[tool].focal))
+    assert again.warnings == ()
+    assert (again.bodies.verts - whole.bodies.verts).abs().max() < 0.05
+
+
 def test_a_moving_camera_is_named(tmp_path):
     """By its path where the tool knows it, else by its gravity."""
     folder = made.write_tram(tmp_path)

@@ -25,7 +25,7 @@ from mover.io.capture.pose_file import GENDERS, NEEDED, moved
 from mover.io.files.fields import At
 from mover.io.people import values as v
 from mover.io.people.found import UNTRACKED, Found, Known, joined
-from mover.io.people.lens import assumed_lens, from_weak, lens, lens_of, movement, tilting
+from mover.io.people.lens import assumed_lens, from_weak, lens, lens_of, movement, own_lens, tilting
 from mover.io.people.values import need
 
 Names = tuple[str, ...]
@@ -199,13 +199,14 @@ def _decoded(at: At, count: int, known: Known) -> Tensor:
         return known.decode(v.tensor(v.rows(at, count)))
 
 
-def gvhmr(path: Path, _: Known) -> Iterator[Person]:
+def gvhmr(path: Path, known: Known) -> Iterator[Person]:
     """hmr4d_results.pt of GVHMR, smpl_params.pt of GEM: one person in all frames."""
     at = v.read_one(path, "GVHMR's or GEM's results", "hmr4d_results.pt", "smpl_params.pt")
     body = need(at, "smpl_params_incam", "body_params_incam")
     world = at.maybe("smpl_params_global", "body_params_global")
     root = None if world is None else need(world, "global_orient")
-    yield Person(body, K=at.maybe("K_fullimg"), upright=root)
+    K, said = own_lens(at.maybe("K_fullimg"), known)
+    yield Person(body, K=K, upright=root, warnings=said)
 
 
 def wham(path: Path, known: Known) -> Iterator[Person]:
@@ -215,20 +216,20 @@ def wham(path: Path, known: Known) -> Iterator[Person]:
         yield Person(at, track, K=K, upright=at.maybe("pose_world"))
 
 
-def prompthmr(path: Path, _: Known) -> Iterator[Person]:
+def prompthmr(path: Path, known: Known) -> Iterator[Person]:
     """results.pkl: `people`, and the cameras beside them."""
     source = v.read_one(path, "PromptHMR's results", "results.pkl")
     camera, world = source.maybe("camera", "camera_world"), source.maybe("camera_world")
-    K, warnings = None if camera is None else _image_lens(camera), ()
+    K, warnings = own_lens(None if camera is None else _image_lens(camera), known)
     if world is not None:
         R = v.stacked(need(world, "Rcw"), 3, 3)
-        warnings = movement(R, v.rows(need(world, "Tcw"), len(R), 3))
+        warnings += movement(R, v.rows(need(world, "Tcw"), len(R), 3))
     for track, one in v.people_of(need(source, "people")):
         body = v.with_fields(need(one, "smplx_cam"), frames=need(one, "frames").value)
         yield Person(body, track, K=K, warnings=warnings)
 
 
-def tram(path: Path, _: Known) -> Iterator[Person]:
+def tram(path: Path, known: Known) -> Iterator[Person]:
     """A folder with camera.npy and hps/hps_track_<k>.npy."""
     tracks = v.files_of(path, "TRAM's results", "hps/hps_track_*.npy")
     file = tracks[0].parent.parent / "camera.npy"
@@ -240,8 +241,9 @@ def tram(path: Path, _: Known) -> Iterator[Person]:
             R = np.swapaxes(v.stacked(turn, 3, 3), 1, 2)
             t = v.rows(need(source, "world_cam_T"), len(R), 3)
             warnings = movement(R, -np.einsum("tij,tj->ti", R, t))
+    lens_of_all, said = own_lens(lens_of_all, known)
     for k, one in enumerate(tracks):
-        yield Person(v.read_any(one), k, K=lens_of_all, warnings=warnings)
+        yield Person(v.read_any(one), k, K=lens_of_all, warnings=said + warnings)
 
 
 def _image_lens(at: At) -> At:
