@@ -54,7 +54,9 @@ def glb_parts(path: Path, hints: Hints) -> Parts:
     found, shell = Pieces(), list[str]()
     for node in _nodes(scene):
         category = hints.names.get(node) or category_of_name(node)
-        if node not in hints.names and _is_shell(category):
+        known = plain_name(category) not in SHELL and not unknown_names([category])
+        of_room = not known and not SHELL.isdisjoint(map(plain_name, category.split()))
+        if of_room and node not in hints.names:  # `Wall back`, but no `floor lamp`
             shell.append(node)
             continue
         matrix = turn @ np.asarray(scene.graph[node][0])
@@ -69,12 +71,6 @@ def glb_parts(path: Path, hints: Hints) -> Parts:
     parts = found.parts(path.stem, path.name, _ground(scene, turn))
     lost = looks_lost(path)
     return dataclasses.replace(parts, camera=camera, notes=(*parts.notes, *[lost] * bool(lost)))
-
-
-def _is_shell(category: str) -> bool:
-    """Whether a name is of the room itself: `Wall back`, but no `floor lamp`."""
-    known = plain_name(category) not in SHELL and not unknown_names([category])
-    return not known and not SHELL.isdisjoint(map(plain_name, category.split()))
 
 
 def _check_apart(found: Pieces, path: Path) -> None:
