@@ -67,6 +67,7 @@ def test_only_a_stature_beyond_the_population_is_named():
     ("bed", (2.0, 0.5, 3.2), "3.20 m deep"),
     ("dining table", (1.2, 0.42, 0.8), ""),  # COCO calls coffee tables so, too
     ("desk", (1.2, 0.42, 0.7), "0.42 m high"),
+    ("dining table", (1.2, 3.0, 0.8), "35.0 standard deviations from the usual 0.74 m"),
     ("statue", (9.0, 9.0, 9.0), ""),
 ])  # fmt: skip
 def test_only_a_size_beyond_the_standard_of_its_class_is_named(category, size, said):

@@ -17,16 +17,20 @@ from test_export import Glb, bounds_of, placed
 
 import mover.io.export.usd
 from mover.app.cli import run_command
-from mover.bodies.skinning import open_body
+from mover.bodies.skinning import open_body, zero_pose
 from mover.core.errors import InputError
+from mover.core.records import rows_of
 from mover.core.types import Bodies, BodyPose, Scene
 from mover.geometry.placement import place_object, placed_at
+from mover.geometry.rotations import axis_angle
 from mover.io.export.amass import export_amass
 from mover.io.export.finished import Finished, keyframes, read_finished
 from mover.io.export.glb import export_glb
 from mover.io.export.scene_glb import export_ply, placement_of
 from mover.io.export.usd import export_usd
 from mover.io.formats import chosen
+from mover.io.people.found import Known
+from mover.io.people.tools import amass
 
 
 def scaled(scene: Scene) -> Scene:
@@ -223,7 +227,9 @@ def test_no_frame_between_keys_is_farther_off_than_is_said_and_few_keys_are_few(
 def test_the_parameters_give_the_bodies_back(tmp_path, up):
     bodies = two_people()
     found = export_amass(finished(tmp_path, bodies), tmp_path, up)
-    for person, file in enumerate(found.files):
+    names = ["amass_0.npz", "amass_1_000014.npz", "amass_1_000056.npz"]  # the second leaves between
+    assert [file.name for file in found.files] == names
+    for file in found.files:
         arrays = np.load(file)
         angles = torch.from_numpy(arrays["poses"])
         count = len(angles)
@@ -235,12 +241,40 @@ def test_the_parameters_give_the_bodies_back(tmp_path, up):
             angles[:, :3], angles[:, 3:66], torch.from_numpy(arrays["trans"]),
             {"left_hand_pose": angles[:, 75:120], "right_hand_pose": angles[:, 120:]},
         )  # fmt: skip
-        truth = bodies.verts[bodies.person == person]
+        rows = torch.isin(bodies.frame, torch.from_numpy(arrays["frame"]))
+        truth = bodies.verts[rows & (bodies.person == int(arrays["person"]))]
         if up == "z":
             x, y, z = truth.unbind(-1)
             truth = torch.stack([x, -z, y], -1)
         assert float((open_body().posed(pose)[0] - truth).norm(dim=-1).max()) < 1e-4
         assert arrays["mocap_framerate"] == 5.0  # every second frame of 10 a second
+    again = amass(tmp_path, Known())
+    parts = [(p.track, p.fields.get("frames").value.tolist()) for p in again]
+    there = [bodies.frame[bodies.person == p] for p in (0, 1)]
+    assert parts == [(0, there[0].tolist()), *((1, f.tolist()) for f in there[1].tensor_split(2))]
+
+
+def test_a_motion_has_equal_steps_and_frames_between_its_rows_lie_between(tmp_path, capsys):
+    """A walk of 100 frames at a constant pace that turns, without three short spans."""
+    kept = torch.tensor([k for k in range(100) if k not in (3, 10, 11, 12, 50, 51)])
+    pose = zero_pose(100, open_body())
+    root = torch.stack([torch.arange(100) * n for n in (0.0, 0.06, 0.0)], -1)  # past half a turn
+    pose = replace(pose, global_orient=root, transl=root * 0.5)
+    every = replace(bodies_of(pose), frame=torch.arange(100))
+    few = replace(rows_of(every, kept), fps=None)
+    out = write_out(tmp_path / "out", furnished(("chair",)), few)
+    assert run_command("export", [str(out), "--to", "amass"]) == 0
+    said = capsys.readouterr().out
+    assert "6 frames without the person interpolated" in said
+    assert "no frame rate ('fps'): 5 frames a second are assumed" in said
+    arrays = np.load(out / "export" / "amass_0.npz")
+    assert (arrays["frame"] == np.arange(100)).all()
+    assert arrays["trans"] == pytest.approx(pose.transl.numpy(), abs=1e-5)
+    turns = axis_angle(torch.from_numpy(arrays["root_orient"]))
+    assert float((turns - axis_angle(root)).abs().max()) < 1e-5
+    (person,) = amass(out / "export", Known())
+    matrix = person.fields.get("turn").value.reshape(3, 3)
+    assert (matrix == np.eye(3)).all()
 
 
 def test_single_objects_stand_in_the_world(tmp_path):

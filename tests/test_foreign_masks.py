@@ -98,6 +98,14 @@ def segments(folder: Path) -> Path:
     return folder / "video_segments.pkl"
 
 
+def segments_of_numpy(folder: Path) -> Path:
+    """The same by np.save, with probabilities in place of logits."""
+    folder.mkdir()
+    tree: Any = {k: {1: np.where(walker(k)[None], 0.97, 0.02)} for k in KEPT}
+    np.save(folder / "video_segments.npy", tree)
+    return folder / "video_segments.npy"
+
+
 def mask_data(folder: Path) -> Path:
     """mask_data/ and json_data/ of grounded_sam2_tracking_demo_with_continuous_id.py."""
     for name in ("mask_data", "json_data"):
@@ -127,7 +135,7 @@ VIDEOS = {  # how a walker is written, his track, and what is said of frames and
     "results from 0": (results(0), 0, "people without tracks: 1, one in each frame"),
     "coco from 1": (coco("", 1), 0),
     "coco of cvat": (coco("frame_{:06d}.PNG", 1), 0),
-    "segments": (segments, 1),
+    "segments": (segments, 1), "np.save": (segments_of_numpy, 1, "probabilities, cut at 0.5"),
     "mask_data": (mask_data, 2),
 }  # fmt: skip
 
@@ -172,10 +180,58 @@ def test_a_stack_of_frames_is_a_person_and_one_of_apart_masks_are_people(tmp_pat
     np.save(tmp_path / "first.npy", np.stack([walker(k) for k in range(6)])[None])
     for name in ("last.npy", "first.npy"):
         assert list(pixels(read_people(tmp_path / name, {}, None))) == [(k, 0) for k in range(6)]
-    np.save(tmp_path / "people.npy", np.stack([walker(0, k) for k in (0, 20, 40)])[:, None])
+    apart = np.stack([walker(0, k) for k in (0, 20, 40)])
+    np.save(tmp_path / "fast.npy", apart[:, None])  # SAM 2's layout of frames, however fast he is
+    found = read_people(tmp_path / "fast.npy", {}, None)
+    assert list(pixels(found)) == [(0, 0), (1, 0), (2, 0)]
+    assert any("people of one image are (n, h, w)" in note for note in found.notes)
+    np.save(tmp_path / "people.npy", apart)
     found = read_people(tmp_path / "people.npy", {}, None)
     assert list(pixels(found)) == [(0, 0), (0, 1), (0, 2)]
     assert any("3 masks are people of one image" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("apart", [False, True])
+@pytest.mark.parametrize("shape", ["fhw", "f1hw", "fhw1"])
+def test_a_map_of_labels_a_frame_has_a_track_a_label(shape, apart, tmp_path):
+    """Two people, at the same time or one after the other."""
+    both = [walker(k) * (k < 4 or not apart) + walker(k, 34) * 2 * (k >= 4 or not apart)
+            for k in range(8)]  # fmt: skip
+    axis = {"fhw": (), "f1hw": 1, "fhw1": 3}[shape]
+    np.savez(tmp_path / "a.npz", masks=np.expand_dims(np.stack(both).astype(np.uint8), axis))
+    got = pixels(read_people(tmp_path / "a.npz", {}, None))
+    assert set(got) == {
+        (k, t) for k in range(8) for t in (1, 2) if not apart or (t == 2) == (k > 3)
+    }
+    assert all((mask == (both[k] == track)).all() for (k, track), mask in got.items())
+
+
+SHAPES = np.stack([walker(0), walker(0, 20), walker(0, 40)])
+SOFT = {
+    "probabilities": np.where(SHAPES, 0.97, 0.02), "half precision": SHAPES.astype(np.float16),
+    "logits": SHAPES * 9.0 - 6, "numbered": SHAPES * np.arange(1, 4)[:, None, None],
+    "grey": np.stack([np.asarray(
+        white(m).resize((W // 2, H // 2), Image.Resampling.LANCZOS).resize(
+            (W, H), Image.Resampling.LANCZOS)) for m in SHAPES]),
+    "grey numbers": SHAPES * 255.0 - SHAPES[:, ::-1] * 0.5 * SHAPES,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", SOFT)
+def test_masks_of_an_array_are_cut_at_half_and_logits_at_zero(kind, tmp_path):
+    np.savez(tmp_path / "a.npz", masks=SOFT[kind])
+    found = read_things(tmp_path / "a.npz", {}, None)
+    for mask, item in zip(SHAPES, found.items, strict=True):
+        got = decode(Masks(H, W, (item.mask or b"",)), 0).numpy()
+        assert (got ^ mask).sum() <= (0.15 if kind == "grey" else 0) * mask.sum()
+    assert any("cut at 0.5" in note for note in found.notes) == (kind == "probabilities")
+
+
+def test_a_dump_of_mmdetection_is_named_with_the_cure(tmp_path):
+    tree = [{"img_id": 0, "pred_instances": {"labels": np.array([56]), "masks": [code(walker(0))]}}]
+    (tmp_path / "out.pkl").write_bytes(pickle.dumps(tree))
+    with pytest.raises(InputError, match=r"^out.pkl.*MMDetection's dump.*expected .*preds/.*json"):
+        read_things(tmp_path / "out.pkl", {}, None)
 
 
 def test_soft_labels_are_labels_and_a_dancer_is_a_person(tmp_path):

@@ -292,6 +292,11 @@ def test_masks_alone_make_a_part_and_what_is_missing_is_said(tmp_path, capsys):
     for word in ("camera.json", "scene.json", "bodies.npz", "people.json", "reference.jpg"):
         assert f"still missing: {word}" in said
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["objects.json"]
+    with pytest.raises(InputError, match="none: there is no such folder, expected a capture"):
+        run_import(ImportArgs("folder", tmp_path / "none", tmp_path / "out"))
+    new, picture_of = tmp_path / "new", picture(tmp_path / "a.png", (64, 48))
+    run_import(ImportArgs("folder", new, new, image=picture_of))  # a capture that is started
+    assert (new / "reference.png").is_file()
 
 
 def test_nothing_is_written_when_a_part_does_not_fit_or_there_is_none(plain, tmp_path):

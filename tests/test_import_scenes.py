@@ -11,6 +11,7 @@ import make_scenes as layouts
 import numpy as np
 import pytest
 import torch
+import trimesh
 from kept_mats import mats_read_once as mats_read_once  # for every test
 
 from mover.core.errors import InputError
@@ -158,6 +159,26 @@ def test_a_gltf_scene_gives_the_room_back_whichever_way_is_up(plain, tmp_path, u
     assert tilt_error(found.scene.camera.R_cam_world, plain) < FINE
     scales = [float(t.scale[0]) for t in plain.things]
     assert [float(p.scale[0]) for p in pieces] == pytest.approx(scales, abs=1e-5)
+
+
+def test_what_is_of_the_room_is_no_furniture_and_a_room_in_one_mesh_is_refused(plain, tmp_path):
+    source = layouts.write_glb(tmp_path / "in.glb", plain, np.eye(4), True)
+    scene = trimesh.load_scene(source)
+    objects = {*scene.graph.nodes_geometry}
+    shell = ["Floor", "Wall_back", "Walls.001", "ceiling"]
+    for name in (*shell, "floor_lamp", "Wall_front"):
+        scene.add_geometry(trimesh.creation.box((0.3, 1.5, 0.3)), node_name=name, geom_name=name)
+    scene.export(source)
+    names = {"Wall_front": "cabinet"}
+    found = imported("glb", source, tmp_path / "out", tmp_path, names=names)
+    ids = {item.id for item in found.capture.scene.objects}
+    assert ids == {*objects, "floor_lamp", "Wall_front"}
+    (note,) = (note for note in found.notes if "left out" in note)
+    assert all(name in note for name in shell)
+    for name, words in {"all": "all is one mesh of", "Floor": "has only Floor"}.items():
+        trimesh.Scene({name: scene.to_mesh()}).export(tmp_path / "joined.glb")
+        with pytest.raises(InputError, match=rf"^joined.glb: {words}.*expected a node for each"):
+            imported("glb", tmp_path / "joined.glb", tmp_path / "out", tmp_path)
 
 
 @pytest.mark.parametrize("frame", ["y", "-y", "z", "camera"])

@@ -10,6 +10,7 @@ import torch
 from analytic import GROUND, make_inputs
 from PIL import Image
 
+from mover.app.cli.video import take_depth
 from mover.core.errors import InputError
 from mover.core.types import DepthImage, Layout
 from mover.energy.config import only
@@ -190,6 +191,13 @@ def test_what_is_wrong_with_measured_depth_is_one_sentence(tmp_path, capture):
         (tmp_path / folder).mkdir()
         with pytest.raises(InputError, match=words):
             find_depth_file(tmp_path)
+    with pytest.raises(InputError, match=r"depth: is a folder, .*: name the file"):
+        take_depth(tmp_path / "depth", tmp_path)
+    values = np.linspace(0.1, 1.0, camera.height)[:, None].repeat(camera.width, 1)
+    np.savez(tmp_path / "a.npz", disp=values)
+    with pytest.raises(InputError, match=r"a\.npz .*'disp' is inverse depth: into disparity/"):
+        read_depth(tmp_path / "a.npz", camera)
+    assert np.allclose(read_depth(tmp_path / "a.npz", camera, metric=False), values)
     Image.new("RGB", (camera.width, camera.height)).save(tmp_path / "a.png")
     np.save(tmp_path / "a.npy", np.ones((5, 5)))
     for name, words in (

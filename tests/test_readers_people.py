@@ -314,10 +314,46 @@ def test_tracks_of_slahmr_are_those_that_its_side_file_names(tmp_path):
     assert found.bodies.person.tolist() == [12] * 5
 
 
+def test_of_slahmrs_stages_the_last_one_counts_and_its_file_is_named(tmp_path):
+    """Names of slahmr/optim/optimizers.py (vye16/slahmr); numbers are iterations."""
+    with np.load(made.write_slahmr(tmp_path) / "video_000060_world_results.npz") as true:
+        arrays = dict(true)
+    (tmp_path / "video_000060_world_results.npz").unlink()
+    names = ("root_fit/v_000030", "smooth_fit/v_000060", "motion_chunks/v_20", "motion_chunks/v_3")
+    for off, name in zip((1, 2, 0, 3), names, strict=True):
+        file = tmp_path / f"{name}_world_results.npz"
+        file.parent.mkdir(exist_ok=True)
+        np.savez(file, **{**arrays, "trans": arrays["trans"] + off})
+    found = bodies_from("slahmr", tmp_path, KNOWN)
+    off = found.bodies.verts.mean(1).numpy() - made.person("smplh")["verts"].mean(1)
+    assert np.abs(off).max() < 2e-3
+    chosen = "of 4 results motion_chunks/v_20_world_results.npz is read"
+    assert f"{tmp_path.name}: {chosen}" in found.warnings
+
+
 def test_the_lens_follows_from_joints_where_the_focal_length_is_missing(tmp_path, faces):
     made.write_sam3dbody(tmp_path, focal=False)
     found = bodies_from("sam3dbody", tmp_path, Known(faces=faces))
     assert np.allclose(found.K, made.lens(1400), atol=0.5)
+
+
+@pytest.mark.parametrize("tool", ["prompthmr", "tram", "gvhmr"])
+def test_a_lens_that_the_files_lack_is_said_and_given_by_its_focal_length(tool, tmp_path):
+    path = made.BODIES[tool](tmp_path)
+    whole = bodies_from(tool, path, KNOWN)
+    if tool == "tram":
+        (path / "camera.npy").unlink()
+    else:
+        tree = load(path)
+        del tree["camera" if tool == "prompthmr" else "K_fullimg"]
+        tree.pop("camera_world", None)
+        dump(tree, path)
+    found = bodies_from(tool, path, KNOWN)
+    assert any("no lens, so the true one is taken" in text for text in found.warnings)
+    assert (found.bodies.verts - whole.bodies.verts).abs().max() > 0.1
+    again = bodies_from(tool, path, replace(KNOWN, focal=CASES[tool].focal))
+    assert again.warnings == ()
+    assert (again.bodies.verts - whole.bodies.verts).abs().max() < 0.05
 
 
 def test_a_moving_camera_is_named(tmp_path):
@@ -535,6 +571,21 @@ def test_people_without_tracks_are_followed_by_position_not_by_rank(tool, tmp_pa
     assert left.unique().tolist() == [0]
     assert sorted(found.bodies.person.tolist()) == [0] * 6 + [1] * 6
     assert any("no tracks, so people are followed" in warning for warning in found.warnings)
+
+
+@pytest.mark.parametrize("above", [True, False])
+def test_images_without_numbers_are_frames_by_rank_and_their_people_are_one_image(
+    above, tmp_path, caplog
+):
+    """SMPLify-X: results/<name of the image>/<person>.pkl."""
+    for name, people in (("bob", 1), ("anna sits", 2), ("room", 1)):
+        for k in range(people):
+            fit = made.fit(0, np.array([[2.0 * k, 0, 4.0]]))
+            made.store(fit, tmp_path / "results" / name / f"{k:03d}.pkl")
+    source = tmp_path if above else tmp_path / "results"
+    found = read("smplifyx", source).bodies
+    assert found.frame.tolist() == [0, 0, 1, 2]
+    assert "names without a number are frames by rank: anna sits = 0, bob = 1" in caplog.text
 
 
 ODD = {

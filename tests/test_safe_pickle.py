@@ -346,6 +346,7 @@ def test_hostile_torch_files_are_refused_and_their_text_names_no_way_around(tmp_
     for value, words in (
         (Calls(os.system, "true"), r"^x\.pt: .*system, expected (tensors|arrays), numbers"),
         (torch.ones(1).expand(1 << 29), "larger than what it holds"),
+        ([np.ones(2), torch.ones(2)], r"numpy's arrays beside tensors, .*store both as one"),
     ):
         torch.save({"a": value}, tmp_path / "x.pt", _use_new_zipfile_serialization=new)
         with pytest.raises(InputError, match=words) as error:

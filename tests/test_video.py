@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from mover.app import chain
 from mover.app.chain import check_bodies, digest, import_bodies, steps_in
@@ -143,8 +144,16 @@ class TestNetworks:
     def test_the_command_says_so_before_any_work(self, tmp_path, capsys, monkeypatch):
         monkeypatch.setenv("HF_HUB_OFFLINE", "1")
         monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "empty"))
-        (tmp_path / "a.mp4").write_bytes(b"no video")
-        assert run_command("video", [str(tmp_path / "a.mp4"), "--out", str(tmp_path / "out")]) == 2
+        (tmp_path / "empty").mkdir()
+        for name, words in (("a.mp4", "a video"), ("a.jpg", "a picture"), ("empty", "has no pic")):
+            if "." in name:
+                (tmp_path / name).write_bytes(b"no video")
+            assert run_command("video", [str(tmp_path / name), "--out", str(tmp_path / "out")]) == 2
+            (line,) = capsys.readouterr().err.splitlines()
+            assert f"{name}: " in line
+            assert words in line
+        Image.new("RGB", (9, 9)).save(tmp_path / "a.jpg")
+        assert run_command("video", [str(tmp_path / "a.jpg"), "--out", str(tmp_path / "out")]) == 2
         lines = capsys.readouterr().err.splitlines()
         assert lines[0] == "mover video: not on this machine:"
         assert sum("hf download" in line for line in lines[1:]) == 2

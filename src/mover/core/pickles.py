@@ -119,7 +119,11 @@ def _of_torch(data: bytes) -> Any:  # noqa: ANN401
     except pickle.UnpicklingError as error:  # its text names the way to run what a file holds
         named = re.search(r"GLOBAL (\S+)", str(error))
         held = f"the pickle holds {named[1][:200]}" if named else "is a broken torch file"
-        raise InputError(f"{held}, expected tensors, numbers, text and containers") from error
+        cure = ""
+        if named and named[1].startswith("numpy"):
+            held, cure = "holds numpy's arrays beside tensors", "; store both as one (x.numpy())"
+        wanted = f"expected tensors, numbers, text and containers{cure}"
+        raise InputError(f"{held}, {wanted}") from error
     if isinstance(value, torch.storage.TypedStorage):
         return torch.empty(0, dtype=value.dtype).set_(value)  # pyright: ignore[reportArgumentType]
     return value

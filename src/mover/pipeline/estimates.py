@@ -88,8 +88,8 @@ def odd_sizes(objects: tuple[SceneObject, ...]) -> tuple[str, ...]:
     for item in objects:
         size, name = box_of(item).size.tolist(), canonical(item.category)
         off = [_beyond(size, kind) for kind in MEANINGS.get(name, (name,))]
-        axis, by, usual = min(off, key=lambda one: one[1])
-        if by > ODD:
+        if min(by for _, by, _ in off) > ODD:
+            axis, by, usual = min(off, key=lambda one: abs(math.log(size[one[0]] / one[2])))
             found.append(
                 f"{item.id} is {size[axis]:.2f} m {AXES[axis]}, {by:.1f} standard deviations from"
                 f" the usual {usual:.2f} m of its class; its initial size, the lens or a person's"

@@ -93,6 +93,9 @@ def run_import(args: ImportArgs) -> None:
     read = chosen("FORMAT", args.format, *IMPORTED)
     from mover.io.capture.merge import import_into
 
+    if args.format == "folder" and not args.source.is_dir() and args.source != args.out:
+        what = "is a file" if args.source.exists() else "there is no such folder"
+        raise InputError(f"{args.source}: {what}, expected a capture")
     with tempfile.TemporaryDirectory(prefix="mover-import-") as work:  # of meshes on the way
         hints = _hints(args, Path(work))
         main: Parts = read(args.source, hints)

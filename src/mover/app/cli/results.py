@@ -120,7 +120,7 @@ def export(arguments: Sequence[str]) -> None:
     """`mover export`."""
     args = parsed(ExportArgs, "mover export", arguments)
     _check_result(args.out)
-    from mover.io.export.finished import Exported, read_finished
+    from mover.io.export.finished import FPS, Exported, read_finished
 
     writers = {target: chosen("--to", target, "export") for target in args.to}
     finished, folder = read_finished(args.out, args.capture), args.out / "export"
@@ -133,6 +133,8 @@ def export(arguments: Sequence[str]) -> None:
         say(f"{target}: {', '.join(str(file) for file in shown)}{more}")
         for note in found.notes:
             say(f"  {note}")
+    if finished.bodies is not None and finished.bodies.fps is None:
+        say(f"note: bodies.npz has no frame rate ('fps'): {FPS:g} frames a second are assumed")
 
 
 @dataclass(frozen=True)

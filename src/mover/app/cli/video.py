@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -64,7 +65,10 @@ def take_depth(depth: Path, capture: Path) -> None:
     from mover.io.files.images import DEPTH, find_depth_file, read_depth, reference_frame
 
     if not depth.is_file():
-        raise InputError(f"{depth}: there is no such file, expected a depth map")
+        what, cure = "there is no such file", ""
+        if depth.is_dir():
+            what, cure = "is a folder", ": name the file of the reference picture in it"
+        raise InputError(f"{depth}: {what}, expected a depth map{cure}")
     if not capture.is_dir():
         raise InputError(f"{capture}: there is no such folder, expected a capture")
     place = capture / DEPTH / f"000000{depth.suffix.lower()}"
@@ -208,13 +212,16 @@ def video_to_room(
         raise InputError(f"{source}: is no video, expected one, or a folder of its pictures")
     flags.preset_named(args.preset, PRESETS)
     chain.check_bodies(args.bodies, args.bodies_tool)
-    if finders is None:
-        _check_needs(args, config)  # in the first second: nothing heavy is loaded yet
-    from mover.perceive.video import pictures_of, read_picture, stamp_of
+    from mover.perceive.video import pictures_of, read_frames, read_picture, stamp_of
 
     pictures = pictures_of(source)
-    if len(pictures) == 1:
+    if pictures:
         read_picture(pictures[0])
+    elif find_spec("av") is not None:
+        next(read_frames(source), None)  # what is no video is refused before what is missing
+    if finders is None:
+        _check_needs(args, config)
+    if len(pictures) == 1:
         say(ONE_IMAGE)
     capture, steps = args.out / "capture", chain.steps_in(args.out, say, STEPS)
     joints = None if chain.OUT in args.keypoints else Path(args.keypoints)

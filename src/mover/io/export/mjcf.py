@@ -26,7 +26,7 @@ def export_mjcf(finished: Finished, folder: Path) -> Exported:
     """Write `mjcf/room.xml` and its meshes."""
     solids = solids_of(finished.scene, Run(finished.out))
     root, meshes = mjcf_of(finished.scene, solids)
-    masses = ", ".join(f"{solid.id} {solid.mass:.0f} kg" for solid in solids)
+    masses = ", ".join(f"{solid.id} {float(f'{solid.mass:.2g}'):g} kg" for solid in solids)
     notes = ["+z is up and the floor is at 0", masses, "no people"]
     if any(item.segments for item in finished.scene.objects):
         _add_stays(root, finished, solids)

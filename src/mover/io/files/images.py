@@ -98,6 +98,7 @@ def write_image(image: Float[Tensor, "h w 3"], path: Path) -> None:
 
 ORIENTATION = 0x0112  # of EXIF: from 5 on the picture lies on its side
 DEPTH, DISPARITY = "depth", "disparity"
+INVERSE = (DISPARITY, "disp", "inverse_depth", "inv_depth")
 NAMES = ("depth", "depth_metric", "metric_depth", "predicted_depth", "depths", "arr_0")
 FARTHEST = 100.0  # [m], what is farther is sky or nonsense
 MILLIMETRES = 1000.0
@@ -161,7 +162,7 @@ def read_depth(
         case ".png":
             values = _of_png(path, metric)
         case ".npz":
-            values = _of_npz(path, NAMES if metric else (DISPARITY, *NAMES), metric, frame)
+            values = _of_npz(path, NAMES if metric else (*INVERSE, *NAMES), metric, frame)
         case ".npy":
             values = _of_frame(read_npy(path), frame)
         case _:
@@ -203,7 +204,10 @@ def _of_npz(path: Path, names: tuple[str, ...], metric: bool, frame: int) -> NDA
     if found is None and metric and points is not None and np.ndim(points.value) == 3:
         return np.asarray(points.value, dtype=np.float64)[..., 2]
     if found is None:
-        at.refuse(f"one of the arrays {', '.join(names)} or points", f"{', '.join(at.value)}")
+        wanted = f"one of the arrays {', '.join(names)} or points"
+        for name in {*INVERSE} & {*at.value}:
+            wanted += f"; {name!r} is inverse depth: into {DISPARITY}/"
+        at.refuse(wanted, f"{', '.join(at.value)}")
     return _of_frame(found, frame)
 
 

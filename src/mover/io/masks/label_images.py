@@ -10,13 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
-from mover.core.pickles import load_plain
 from mover.io.capture.parts import UNKNOWN
 from mover.io.files.fields import At, read_json
 from mover.io.files.images import opened
-from mover.io.files.npz import read_npy, read_npz
+from mover.io.files.npz import read_npy
 from mover.io.masks.instances import Instance, Instances, Names, Size, code_of, frames_of
-from mover.io.people.values import natural, number_in
+from mover.io.people.values import natural, number_in, read_any
 
 MASKS = ("masks", "pred_masks", "mask", "segmentation", "arr_0")
 TRACKS = ("object_ids", "obj_ids", "track_ids", "track", "person", "ids")
@@ -32,6 +31,7 @@ FRAME_WORDS = frozenset(
 )
 """What stands before the number of a frame."""
 MOST_LABELS = 256
+FEW = 16  # so few small values are labels
 WHITE = (255, 65535, 0xFFFFFF)
 NEAR = 8  # values so near to black or white are black or white, where a mask is soft
 PHOTO = 0.3  # share of the pixels that are neither dark nor bright, which masks have not
@@ -194,7 +194,7 @@ def _hardened(pixels: NDArray[np.int64], name: str, *, lossy: bool) -> NDArray[n
     """Labels without the grey rims of soft or resized masks: values that fill no area are rims."""
     values = np.unique(pixels)
     most = int(values[-1])
-    if len(values) <= 2 or (most < 200 and len(values) < 16):
+    if len(values) <= 2 or (most < 200 and len(values) < FEW):
         return pixels
     if most in WHITE[:2]:
         near = NEAR * most // 255
@@ -223,22 +223,31 @@ def _hardened(pixels: NDArray[np.int64], name: str, *, lossy: bool) -> NDArray[n
 def read_mask_arrays(path: Path, names: Names, *, people: bool = False) -> Instances:
     """Masks of an .npz, an .npy or a pickle.
 
-    `masks` is (n, h, w), (n, 1, h, w) or (frames, objects, h, w), as booleans, bytes or logits
-    (above 0 is inside); or (h, w), a label map of whole numbers. Beside it may stand `scores`,
-    `labels` (names), `object_ids` and `frame`. With a single object id (n, 1, h, w) is one thing in
-    n frames, and so are n masks of people that lie on each other. Boxes are those of the masks. A
-    pickle may also be what SAM 2's video predictor gives: {frame: {object: mask}}.
+    `masks` is (n, h, w), (n, 1, h, w) or (frames, objects, h, w), as booleans, bytes, probabilities
+    (from 0 to 1, cut at .5) or logits (above 0 is inside); or a label map of whole numbers, (h, w),
+    or one for each frame, in which a label is a track. Beside it may stand `scores`, `labels`
+    (names), `object_ids` and `frame`. With a single object id (n, 1, h, w) is one thing in n
+    frames, and so is that of people without ids, as are n masks of people that lie on each other.
+    Boxes are those of the masks. A pickle, or the .npy of a mapping, may also be what SAM 2's video
+    predictor gives: {frame: {object: mask}}.
     """
-    read = {".npz": read_npz, ".npy": read_npy}.get(path.suffix.lower())
-    tree = load_plain(path) if read is None else read(path).value
-    at = At({"masks": tree} if isinstance(tree, np.ndarray) else tree, path.name)
-    at = at.maybe("video_segments") or at if read is None else at
+    at, notes = read_any(path), list[str]()
+    if isinstance(at.value, np.ndarray):
+        at = at.holding({"masks": at.value})
+    match at.value:
+        case [{"pred_instances": _}, *_]:
+            found = "MMDetection's dump of a test ('pred_instances')"
+            at.refuse("masks: DetInferencer's preds/<image>.json (out_dir) has them", found)
+        case _:
+            pass
+    at = at.maybe("video_segments") or at
     frames = [(key, at.get(key)) for key in at.mapping()]
     if frames and all(key.isdecimal() and isinstance(at.value, Mapping) for key, at in frames):
-        rows = [row for key, at in frames for row in _segments(int(key), at, names)]
+        rows = [row for key, at in frames for row in _segments(int(key), at, names, notes)]
         if not rows:
             at.refuse("masks of objects in frames")
-        return _gathered(rows, path.name, "masks", (int(key) for key, _ in frames))
+        said = tuple(dict.fromkeys(notes))
+        return _gathered(rows, path.name, "masks", (int(key) for key, _ in frames), said)
     given = at.maybe(*MASKS)
     if given is None:
         at.refuse(f"an array named {', '.join(MASKS)}", f"the arrays {sorted(at.value)[:6]}")
@@ -247,17 +256,63 @@ def read_mask_arrays(path: Path, names: Names, *, people: bool = False) -> Insta
         stack = np.moveaxis(stack, -1, 1)  # (frames, h, w, 1)
     if not isinstance(stack, np.ndarray) or stack.dtype.kind not in "buif" or stack.ndim < 2:
         given.refuse("an array of masks (n, h, w), (frames, objects, h, w) or labels (h, w)")
-    if stack.ndim == 2 and stack.dtype != np.bool_ and not (np.nan_to_num(stack) % 1).any():
-        labels = _labels_in(given)
-        rows = ((stack == v, Instance(names.get(str(v), UNKNOWN), None, None)) for v in labels)
-        size = stack.shape[1], stack.shape[0]
-        return replace(_gathered(rows, at.file, "masks", ()), size=size)
     if stack.ndim > 4 or not stack.size:
         given.refuse("an array of masks (n, h, w) or (frames, objects, h, w)")
-    return _of_stack(at, stack, names, people=people)
+    stack = _cut(given, stack, notes)
+    flat, size = stack.reshape(-1, *stack.shape[-2:]), (stack.shape[-1], stack.shape[-2])
+    if stack.dtype == np.bool_ or (stack.ndim > 2 and not _are_maps(stack)):
+        found = _of_stack(at, stack, names, people=people)
+        return replace(found, notes=(*notes, *found.notes))
+    still, frame = stack.ndim == 2, at.maybe("frame")
+    numbers = range(len(flat)) if frame is None else frame.indices(len(flat)).tolist()
+    rows = (
+        (pixels == v, Instance(names.get(str(v), UNKNOWN), None, None, 1.0, number, track))
+        for number, pixels in zip(numbers, flat, strict=True)
+        for v in _labels_in(given.holding(pixels))
+        for track in (None if still else v,)
+    )
+    return replace(_gathered(rows, at.file, "masks", () if still else numbers), size=size)
 
 
-def _segments(frame: int, at: At, names: Names) -> Iterator[Row]:
+def _cut(at: At, value: NDArray[Any], notes: list[str]) -> NDArray[Any]:
+    """Booleans, or whole numbers: logits are cut at 0, probabilities and grey values at half."""
+    if value.dtype == np.bool_:
+        return value
+    known = value[np.isfinite(value)]
+    low, top = float(known.min(initial=0)), float(known.max(initial=0))
+    if low < 0:
+        return value > 0
+    if value.dtype.kind == "f":
+        if (known % 1).any():
+            if top <= 1:
+                notes.append(f"{at.file}: numbers from 0 to 1 are probabilities, cut at 0.5")
+            return value > top / 2 if top > 1 else value > 0.5
+        value = np.nan_to_num(value, posinf=0).astype(np.int64)
+    flat = value.reshape(-1, *value.shape[-2:])
+
+    def hard(pixels: NDArray[Any]) -> NDArray[np.int64]:
+        return _hardened(pixels.astype(np.int64), at.file, lossy=False)
+
+    if value.ndim == 2:
+        return hard(value)
+    if top in WHITE and any(
+        len(np.unique(m)) > 2 and np.isin(hard(m), (0, top)).all() for m in flat
+    ):
+        return value > top // 2
+    return value
+
+
+def _are_maps(stack: NDArray[Any]) -> bool:
+    """Whether an array has a map of labels for each frame, not a mask for each object."""
+    if stack.ndim == 4 and 1 not in stack.shape[:2]:
+        return False
+    labels = [np.unique(m[m > 0]).tolist() for m in stack.reshape(-1, *stack.shape[-2:])]
+    known, lone = {v for one in labels for v in one}, sum(len(one) == 1 for one in labels)
+    shared = 1 < len(known) < lone and max(known) < FEW  # or each object has a number of its own
+    return shared or any(len(one) > 1 for one in labels)
+
+
+def _segments(frame: int, at: At, names: Names, notes: list[str]) -> Iterator[Row]:
     """The masks of a frame by the numbers of their objects."""
     for track in at.mapping():
         mask = at.get(track)
@@ -265,7 +320,8 @@ def _segments(frame: int, at: At, names: Names) -> Iterator[Row]:
         if pixels.ndim != 2 or pixels.dtype.kind not in "buif" or not track.isdecimal():
             mask.refuse("a mask (1, h, w) under the number of its object")
         name = names.get(track, UNKNOWN)
-        yield pixels > 0, Instance(name, None, None, 1.0, frame, int(track))
+        inside = _cut(mask, pixels, notes) > 0
+        yield inside, Instance(name, None, None, 1.0, frame, int(track))
 
 
 def _of_stack(at: At, stack: NDArray[Any], names: Names, *, people: bool) -> Instances:
@@ -276,10 +332,14 @@ def _of_stack(at: At, stack: NDArray[Any], names: Names, *, people: bool) -> Ins
     flat = stack.reshape(-1, height, width)
     rows, tracks, notes = len(flat), None, ()
     bare = people and ids is None and frame is None and (stack.ndim < 4 or 1 in stack.shape[:2])
-    in_frames = bare and rows > 1 and _follow_each_other(flat)
+    sam = stack.ndim == 4 and stack.shape[1] == 1
+    in_frames = bare and rows > 1 and (sam or _follow_each_other(flat))
     if bare and rows > 1:
         how = "are people of one image; frames need an array 'frame' or 'object_ids' beside"
-        how = "that lie on each other are a person in as many frames" if in_frames else how
+        if in_frames:
+            how = "that lie on each other are a person in as many frames"
+        if sam:
+            how = "(n, 1, h, w) are a person in n frames; people of one image are (n, h, w)"
         notes = (f"{at.file}: {rows} masks {how}",)
     if in_frames or (stack.ndim == 4 and (stack.shape[1] != 1 or (one_id and frame is None))):
         count = 1 if in_frames else stack.shape[1]

@@ -44,6 +44,13 @@ def assumed_lens(
     return lens(f, f, size[0] / 2, size[1] / 2)
 
 
+def own_lens(given: At | None, known: Known) -> tuple[At | None, tuple[str, ...]]:
+    """The lens of the files, else that of the user's focal length, else what to say of it."""
+    if given is not None or known.focal is not None:
+        return given or assumed_lens(known, lambda *_: 1.0), ()
+    return None, ("has no lens, so the true one is taken for the tool's: --focal gives that [px]",)
+
+
 def from_weak(crop: Float[Tensor, "bodies 4"], camera: Camera) -> Float[Tensor, "bodies 3"]:
     """Position of bodies by weak perspective of the whole image: s_x, s_y, p, q [m].
 

@@ -25,7 +25,7 @@ from mover.io.capture.pose_file import GENDERS, NEEDED, moved
 from mover.io.files.fields import At
 from mover.io.people import values as v
 from mover.io.people.found import UNTRACKED, Found, Known, joined
-from mover.io.people.lens import assumed_lens, from_weak, lens, lens_of, movement, tilting
+from mover.io.people.lens import assumed_lens, from_weak, lens, lens_of, movement, own_lens, tilting
 from mover.io.people.values import need
 
 Names = tuple[str, ...]
@@ -47,6 +47,7 @@ AMASS = {156: "smplh", 165: "smplx", 72: "smpl"}
 AMASS_PARTS = {"root_orient": 3, "pose_body": 63, "pose_jaw": 3, "pose_eye": 6, "pose_hand": 90}
 """What newer files have in its place, and the numbers of a row of each."""
 NO_CAMERA = "is a motion in a world of its own: where the camera saw the people is not known"
+STAGES = ("root_fit", "smpl_fit", "smooth_fit", "motion_fit", "motion_chunks")  # of SLAHMR
 Y_UP = np.array([[1, 0, 0, 0, 0, 1, 0, -1, 0]])  # AMASS has +z up
 
 
@@ -198,13 +199,14 @@ def _decoded(at: At, count: int, known: Known) -> Tensor:
         return known.decode(v.tensor(v.rows(at, count)))
 
 
-def gvhmr(path: Path, _: Known) -> Iterator[Person]:
+def gvhmr(path: Path, known: Known) -> Iterator[Person]:
     """hmr4d_results.pt of GVHMR, smpl_params.pt of GEM: one person in all frames."""
     at = v.read_one(path, "GVHMR's or GEM's results", "hmr4d_results.pt", "smpl_params.pt")
     body = need(at, "smpl_params_incam", "body_params_incam")
     world = at.maybe("smpl_params_global", "body_params_global")
     root = None if world is None else need(world, "global_orient")
-    yield Person(body, K=at.maybe("K_fullimg"), upright=root)
+    K, said = own_lens(at.maybe("K_fullimg"), known)
+    yield Person(body, K=K, upright=root, warnings=said)
 
 
 def wham(path: Path, known: Known) -> Iterator[Person]:
@@ -214,20 +216,20 @@ def wham(path: Path, known: Known) -> Iterator[Person]:
         yield Person(at, track, K=K, upright=at.maybe("pose_world"))
 
 
-def prompthmr(path: Path, _: Known) -> Iterator[Person]:
+def prompthmr(path: Path, known: Known) -> Iterator[Person]:
     """results.pkl: `people`, and the cameras beside them."""
     source = v.read_one(path, "PromptHMR's results", "results.pkl")
     camera, world = source.maybe("camera", "camera_world"), source.maybe("camera_world")
-    K, warnings = None if camera is None else _image_lens(camera), ()
+    K, warnings = own_lens(None if camera is None else _image_lens(camera), known)
     if world is not None:
         R = v.stacked(need(world, "Rcw"), 3, 3)
-        warnings = movement(R, v.rows(need(world, "Tcw"), len(R), 3))
+        warnings += movement(R, v.rows(need(world, "Tcw"), len(R), 3))
     for track, one in v.people_of(need(source, "people")):
         body = v.with_fields(need(one, "smplx_cam"), frames=need(one, "frames").value)
         yield Person(body, track, K=K, warnings=warnings)
 
 
-def tram(path: Path, _: Known) -> Iterator[Person]:
+def tram(path: Path, known: Known) -> Iterator[Person]:
     """A folder with camera.npy and hps/hps_track_<k>.npy."""
     tracks = v.files_of(path, "TRAM's results", "hps/hps_track_*.npy")
     file = tracks[0].parent.parent / "camera.npy"
@@ -239,8 +241,9 @@ def tram(path: Path, _: Known) -> Iterator[Person]:
             R = np.swapaxes(v.stacked(turn, 3, 3), 1, 2)
             t = v.rows(need(source, "world_cam_T"), len(R), 3)
             warnings = movement(R, -np.einsum("tij,tj->ti", R, t))
+    lens_of_all, said = own_lens(lens_of_all, known)
     for k, one in enumerate(tracks):
-        yield Person(v.read_any(one), k, K=lens_of_all, warnings=warnings)
+        yield Person(v.read_any(one), k, K=lens_of_all, warnings=said + warnings)
 
 
 def _image_lens(at: At) -> At:
@@ -299,15 +302,18 @@ def phalp(path: Path, known: Known) -> Iterator[Person]:
 
 
 def slahmr(path: Path, _: Known) -> Iterator[Person]:
-    """The last *_world_results.npz of a folder: arrays of (people, frames, numbers).
+    """The highest *_world_results.npz of the last stage: arrays of (people, frames, numbers).
 
     track_info.json beside it gives the tracks and the frames in which a person is visible.
 
     Raises:
         InputError: If it is the prior's file, or another.
     """
-    path = v.files_of(path, "SLAHMR's results", "**/*_world_results.npz")[-1]
-    source = v.read_any(path)
+    stage = {name: rank for rank, name in enumerate(STAGES)}
+    files = v.files_of(path, "SLAHMR's results", "**/*_world_results.npz")
+    path = max(files, key=lambda f: (stage.get(f.parent.name, -1), v.natural(Path(f.name))))
+    chosen = f"of {len(files)} results {path.parent.name}/{path.name} is read"
+    notes, source = (chosen,) if len(files) > 1 else (), v.read_any(path)
     if "prior_results" in path.name and source.maybe("trans") is None:
         raise InputError(
             f"{path.name}: is SLAHMR's motion prior, without positions; expected the file "
@@ -327,7 +333,7 @@ def slahmr(path: Path, _: Known) -> Iterator[Person]:
         of_one = {name: values[who][frames] for name, values in fields.items()}
         at = At({**of_one, "betas": betas[who], "frames": frames}, source.file)
         R, t = v.stacked(at.get("cam_R"), 3, 3), v.stacked(at.get("cam_t"), 3)
-        yield Person(at, track, K=K, warnings=movement(R, t))
+        yield Person(at, track, K=K, warnings=notes + movement(R, t))
 
 
 def _visible(path: Path, count: int, people: int) -> Iterator[tuple[int, int, NDArray[np.int64]]]:
@@ -343,11 +349,13 @@ def _visible(path: Path, count: int, people: int) -> Iterator[tuple[int, int, ND
 
 def prox(path: Path, known: Known) -> Iterator[Person]:
     """results/<frame>/<person>.pkl or <frame>.pkl of SMPLify-X and PROX, or one such file."""
-    files = v.files_of(path, "fits", "**/*.pkl")
-    images = [
-        file.parent if re.fullmatch(r"\d{1,3}", file.stem) and re.search(r"\d", file.parent.name)
-        else file for file in files
-    ]  # fmt: skip
+    files, homes = v.files_of(path, "fits", "**/*.pkl"), (path, path / "results")
+
+    def image_of(file: Path) -> Path:
+        inside = file.parent not in homes or re.search(r"\d", file.parent.name)
+        return file.parent if inside and re.fullmatch(r"\d{1,3}", file.stem) else file
+
+    images = [image_of(file) for file in files]
     for file, frame in zip(files, v.frames_in(images, path, known), strict=True):
         yield Person(v.read_any(file), None, frame)
 
@@ -359,11 +367,14 @@ def smplifyx(path: Path, known: Known) -> Iterator[Person]:
 
 
 def amass(path: Path, _: Known) -> Iterator[Person]:
-    """Motions of AMASS: one npz a person."""
-    for track, file in enumerate(v.files_of(path, "motions of AMASS", "*.npz")):
+    """Motions of AMASS: one npz a person; ours say which, in which frames and which way is up."""
+    for rank, file in enumerate(v.files_of(path, "motions of AMASS", "*.npz")):
         at = v.read_any(file)
         count = len(v.stacked(need(at, "trans"), 3))
-        at = v.with_fields(at, turn=Y_UP)
+        person, up, frame = (at.maybe(name) for name in ("person", "up_axis", "frame"))
+        track = rank if person is None else int(v.one_number(person))
+        turn = Y_UP if up is None or v.lone(up) != "y" else np.eye(3).reshape(1, 9)
+        at = v.with_fields(at, turn=turn, frames=np.arange(count) if frame is None else frame.value)
         if at.maybe("poses") is None and at.maybe("pose_body") is not None:
             given = [(at.maybe(name), width) for name, width in AMASS_PARTS.items()]
             rows = [np.zeros((count, n)) if x is None else v.rows(x, count, n) for x, n in given]
@@ -417,7 +428,7 @@ TOOLS = {
     "4dhumans": HMR2,
     "amass": Tool(
         amass, "smplx", pose=("poses",), translation="trans", camera=("turn",),
-        rate=("mocap_frame_rate", "mocap_framerate"), space="world",
+        frames=("frames",), rate=("mocap_frame_rate", "mocap_framerate"), space="world",
     ),
     "gem": GVHMR,
     "gvhmr": GVHMR,

@@ -1,9 +1,9 @@
 """Files of other tools as plain values: fields under any of their names, NaN let through."""
 
+import logging
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,11 @@ from torch import Tensor
 
 from mover.core.errors import InputError
 from mover.core.pickles import load_plain
-from mover.core.records import BROKEN
 from mover.io.files.fields import LARGEST, LAST_INDEX, At, existing, read_json
-from mover.io.files.npz import AMASS, is_amass, read_npz
+from mover.io.files.npz import AMASS, is_amass, read_npy, read_npz
 from mover.io.people.found import Known
+
+log = logging.getLogger(__name__)
 
 PICKLES = (".pkl", ".pickle", ".joblib", ".pt", ".pth")
 TREES = {".npz": read_npz, ".json": read_json}
@@ -40,8 +41,10 @@ def read_any(path: Path) -> At:
     if kind in TREES:
         return TREES[kind](path)
     if kind == ".npy":
-        with suppress(*BROKEN), path.open("rb") as file:  # else a pickled object
-            return At(np.load(file, allow_pickle=False), path.name)
+        with path.open("rb") as file:
+            plain = b"'|O'" not in file.readline(1000)  # of the header: a pickled object
+        if plain:
+            return read_npy(path)
     return At(load_plain(path), path.name)
 
 
@@ -114,6 +117,10 @@ def frames_in(images: Sequence[Path], path: Path, known: Known) -> list[int]:
     if frames is None:
         numbered = frame_numbers(names, path.name)
         frames = {name: number - known.first for name, number in numbered.items()}
+        bare = [name for name in frames if not re.search(r"\d", name)]
+        if bare and len(frames) > 1:
+            ranks = ", ".join(f"{name} = {frames[name]}" for name in bare[:4])
+            log.warning("%s: names without a number are frames by rank: %s", path.name, ranks)
     if unknown := [image for image, name in zip(images, names, strict=True) if name not in frames]:
         raise InputError(f"{unknown[0]}: is no frame of the recording")
     return [frames[name] for name in names]

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from mover.core.errors import InputError
+from mover.furniture.library import plain_name, unknown_names
 from mover.geometry.rotations import affine
 from mover.io.capture.parts import Hints, Parts
 from mover.io.files.fields import At, reason
@@ -29,6 +30,8 @@ UP: dict[str, Matrix] = {
 }
 """The user's world -> +y up, right-handed."""
 OURS = ("ground", "camera", "light")  # what a scene.glb of this program has beside its furniture
+SHELL = frozenset({"floor", "wall", "ceiling", "ground", "roof", "window", "door"})
+WIDEST = 2.5  # [m], no furniture is wider and deeper
 NO_ROOM = 1e-5  # [share], a transform that is nothing but rounding
 
 
@@ -48,16 +51,37 @@ def glb_parts(path: Path, hints: Hints) -> Parts:
         turn[:3, 3] = -turn[:3, :3] @ pose[:3, 3]
         R = FLIP @ pose[:3, :3].T @ turn[:3, :3].T
         camera = At({**fields, "R_cam_world": R.tolist()}, path.name, "cameras")
-    found = Pieces()
+    found, shell = Pieces(), list[str]()
     for node in _nodes(scene):
         category = hints.names.get(node) or category_of_name(node)
+        known = plain_name(category) not in SHELL and not unknown_names([category])
+        of_room = not known and not SHELL.isdisjoint(map(plain_name, category.split()))
+        if of_room and node not in hints.names:  # `Wall back`, but no `floor lamp`
+            shell.append(node)
+            continue
         matrix = turn @ np.asarray(scene.graph[node][0])
         found.add_parts(category, node, _below(scene, node), matrix, hints.work)
+    if shell:
+        said = f"{', '.join(shell)} left out, as parts of the room"
+        found.notes.append(f"{path.name}: {said} (--names {shell[0]}=table keeps it)")
     if not found.rows:
-        raise InputError(f"{path.name}: has no meshes, expected a glTF scene of furniture")
+        has = f"only {', '.join(shell)}" if shell else "no meshes"
+        raise InputError(f"{path.name}: has {has}, expected a node for each object of furniture")
+    _check_apart(found, path)
     parts = found.parts(path.stem, path.name, _ground(scene, turn))
     lost = looks_lost(path)
     return dataclasses.replace(parts, camera=camera, notes=(*parts.notes, *[lost] * bool(lost)))
+
+
+def _check_apart(found: Pieces, path: Path) -> None:
+    """Refuse a room whose objects were joined: its only object is wider and deeper than any."""
+    row, (mesh, _) = found.rows[0], next(iter(found.meshes.values()))
+    size = np.ptp(mesh.verts.numpy(), axis=0) * row["scale"]
+    if len(found.rows) == 1 and min(size[0], size[2]) > WIDEST:
+        raise InputError(
+            f"{path.name}: {row['id']} is one mesh of {size[0]:.1f} x {size[2]:.1f} m, as of a "
+            "whole room, expected a node for each object: export it before its objects are joined"
+        )
 
 
 def up_axes(up: str) -> Matrix:
