@@ -34,7 +34,7 @@ from mover.core.types import Keypoints, Masks, People, Scene
 from mover.geometry.rle import decode, tight_box
 from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.scene_file import read_scene
-from mover.io.people.keypoints import read_keypoints
+from mover.io.people.keypoints import read_keypoints, write_keypoints
 from mover.perceive import mediapipe
 from mover.perceive.capture import Finders, perceive, read_picture_of
 from mover.perceive.config import FramesConfig, PerceiveConfig
@@ -113,6 +113,53 @@ def test_another_video_in_the_same_folder_leaves_nothing_of_the_first(tmp_path: 
     assert not (tmp_path / "c" / "keypoints.npz").exists()
 
 
+def absent(_clip: Clip, _config: PerceiveConfig, _: Observer = silent) -> Finds:
+    raise InputError("no network")
+
+
+def test_what_replaced_a_file_stays_until_a_new_flag_gives_it(tmp_path: Path, capsys):
+    """What was removed is made again; of another video that is said."""
+    for name, shot in (("v", Shot()), ("w", Shot(1))):
+        filmed(tmp_path / f"{name}.mp4", shot, range(0, SECOND, 3))
+    for name in "ab":
+        shape = {"label": name, "points": [[50, 40], [80, 40], [80, 70]], "shape_type": "polygon"}
+        tree = {"imageWidth": W, "imageHeight": H, "shapes": [shape]}
+        (tmp_path / f"{name}.json").write_text(json.dumps(tree))
+    (tmp_path / "none.npz").write_text("")  # no bodies: each run ends before they are written
+    capture = tmp_path / "out" / "capture"
+    files = [capture / n for n in ("objects.json", "people.json", "keypoints.npz", "camera.json")]
+
+    def again(video: str = "v", **flags: Any) -> tuple[list[bytes | None], str]:
+        """The files after a run, and what it says."""
+        args = VideoArgs(tmp_path / f"{video}.mp4", tmp_path / "out", **flags)
+        with pytest.raises(InputError, match=r"none\.npz: cannot be read"):
+            video_to_room(replace(args, bodies=str(tmp_path / "none.npz")), FINDERS)
+        return [f.read_bytes() for f in files], capsys.readouterr().out
+
+    again(fov=60.0)
+    made, _ = again(fov=60.0, objects=tmp_path / "a.json")
+    joints = read_keypoints(files[2])
+    write_keypoints(replace(joints, points=joints.points + 1), files[2])
+    for file in (files[0], files[1], files[3]):
+        file.write_text(file.read_text() + " ")
+    own = [file.read_bytes() for file in files]
+    stays = "is yours and stays"
+    for video, flags in (
+        ("v", {}), ("v", {"fov": 60.0}), ("w", {"fov": 60.0, "objects": tmp_path / "a.json"})
+    ):  # fmt: skip
+        found, said = again(video, **flags)
+        assert found == own
+        assert said.count(stays) == 4
+        assert said.count("though the video") == (4 if video == "w" else 0)
+    found, said = again(fov=70.0, objects=tmp_path / "b.json")
+    assert found[1:3] == own[1:3]
+    assert b'"b"' in found[0]
+    assert found[3] != own[3]
+    assert (said.count("was yours"), said.count(stays)) == (2, 2)
+    files[2].unlink()
+    assert again(fov=70.0, objects=tmp_path / "b.json")[0][2] == made[2]
+
+
 SWAY = [(0, 0), (3, 1), (5, 2), (4, 1), (2, 0), (0, 0)]
 """Where in the world the pictures of a swaying camera begin [px]."""
 
@@ -181,9 +228,6 @@ def test_without_a_network_for_furniture_all_else_is_written_and_the_outlines_ar
         points = torch.full((len(tracks.frame), 33, 2), 40.0)
         rows = tracks.frame, tracks.person
         return tracks, Keypoints(points, torch.ones(points.shape[:2]), "mediapipe33", *rows, None)
-
-    def absent(_clip: Clip, _config: PerceiveConfig, _: Observer = silent) -> Finds:
-        raise InputError("no network")
 
     finders = replace(NO_FINDERS, poses=poses, instances=absent)
     out = tmp_path / "out"

@@ -103,15 +103,18 @@ def perceive(
             all else is written.
     """
     clip, drift, tracks, joints = moving_people(video, out, config, run, say, finders)
-    at, text = camera_by(video, (clip.width, clip.height))
+    size, keep = (clip.width, clip.height), video.keep
+    own = "camera.json" in keep
+    at, text = lens_of(size, out / "camera.json") if own else camera_by(video, size)
     if text is not None:
         say(f"warning: {text}")
     camera = camera_of(at)
     clean = reference_of(clip, drift, tracks)
     lacking: InputError | None = None
+    kept = read_json(out / "objects.json").value if "objects.json" in keep else None
     try:
-        if video.objects is not None:
-            objects = own_objects(video, clip, drift)
+        if kept is not None or video.objects is not None:
+            objects = own_objects(video, clip, drift) if kept is None else kept
         else:
             objects = furniture_in(clean, camera, config, run, finders, out)
     except InputError as error:  # all else is written
@@ -130,19 +133,32 @@ def perceive(
         "without a person"
     )
     write_image(clean.picture, out / "reference.png")
-    given = {name: at.value[name] for name in LENS_FIELDS if at.value.get(name) is not None}
-    camera, by_lines = lens_by_lines(camera, given.get("focal_spread"), clean, say)
-    write_json({**camera_to_json(camera), **given, **by_lines}, out / "camera.json")
-    people = replace(tracks, frame=clip.numbers[tracks.frame]) if tracks.masks.counts else None
-    tree = people_to_json(people, hidden_mask(clean), clip.fps, clip.numbers.tolist())
-    write_json(tree, out / "people.json")
-    if joints is not None and len(joints.frame):
-        write_keypoints(replace(joints, frame=clip.numbers[joints.frame]), out / "keypoints.npz")
-    else:
-        (out / "keypoints.npz").unlink(missing_ok=True)  # of another video
+    if not own:
+        given = {name: at.value[name] for name in LENS_FIELDS if at.value.get(name) is not None}
+        camera, by_lines = lens_by_lines(camera, given.get("focal_spread"), clean, say)
+        write_json({**camera_to_json(camera), **given, **by_lines}, out / "camera.json")
+    write_people(tracks, joints, clip, clean, out, keep)
     if lacking is not None:
         raise lacking
-    write_json(objects, out / "objects.json")
+    if "objects.json" not in keep:
+        write_json(objects, out / "objects.json")
+
+
+def write_people(
+    tracks: People, joints: Keypoints | None, clip: Clip, clean: Clean, out: Path,
+    keep: tuple[str, ...],
+) -> None:  # fmt: skip
+    """Write people.json and keypoints.npz, by the numbers of the frames, unless they are kept."""
+    if "people.json" not in keep:
+        people = replace(tracks, frame=clip.numbers[tracks.frame]) if tracks.masks.counts else None
+        tree = people_to_json(people, hidden_mask(clean), clip.fps, clip.numbers.tolist())
+        write_json(tree, out / "people.json")
+    if "keypoints.npz" not in keep:
+        if joints is not None and len(joints.frame):
+            joints = replace(joints, frame=clip.numbers[joints.frame])
+            write_keypoints(joints, out / "keypoints.npz")
+        else:
+            (out / "keypoints.npz").unlink(missing_ok=True)  # of another video
 
 
 def outlined(objects: dict[str, Any] | None, camera: Camera) -> Bool[Tensor, "h w"] | None:

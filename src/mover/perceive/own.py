@@ -55,6 +55,8 @@ class Video:
     """Furniture: COCO, labelme or boxes alone."""
     objects_frame: int | None = None
     """The frame of the video in which it is outlined; None: the clean picture."""
+    keep: tuple[str, ...] = ()
+    """Files of the capture that the user replaced: they are read, not written."""
 
 
 def own_keypoints(video: Video, clip: Clip, drift: Drift, say: Say) -> Keypoints | None:

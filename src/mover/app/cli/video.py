@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -210,21 +210,14 @@ def video_to_room(
     chain.check_bodies(args.bodies, args.bodies_tool)
     if finders is None:
         _check_needs(args, config)  # in the first second: nothing heavy is loaded yet
-    from mover.perceive.video import pictures_of, read_picture, stamp_of
+    from mover.perceive.video import pictures_of, read_picture
 
     pictures = pictures_of(source)
     if len(pictures) == 1:
         read_picture(pictures[0])
         say(ONE_IMAGE)
     capture, steps = args.out / "capture", chain.steps_in(args.out, say, STEPS)
-    joints = None if chain.OUT in args.keypoints else Path(args.keypoints)
-    files = (args.people_masks, args.objects, joints)
-    given = (args.camera, args.fov, args.tilt, args.camera_height)
-    words = (repr(config), *given, args.keypoints, args.objects_frame)
-    stamp = str((str(source.resolve()), *stamp_of(source)))
-    made_from = [stamp, *map(str, words), *("none" if file is None else file for file in files)]
-    made = capture / "objects.json"
-    steps.do(STEPS[0], made_from, made, lambda: _pictures(args, config, capture, finders))
+    made = _taken(args, config, capture, steps, finders)
     if not json.loads(made.read_text())["annotations"]:
         raise InputError(
             f"{capture / 'reference.png'}: the network finds no furniture in it, so there is "
@@ -237,10 +230,45 @@ def video_to_room(
     _room(capture, args)
 
 
+def _taken(
+    args: VideoArgs, config: PerceiveConfig, capture: Path, steps: chain.Steps,
+    finders: "Finders | None",
+) -> Path:  # fmt: skip
+    """All of the capture but bodies and the first scene, and what stays of it; its last file."""
+    own = args.keypoints not in (NETWORK, MEDIAPIPE) and chain.OUT not in args.keypoints
+    joints = Path(args.keypoints) if own else args.keypoints.replace(NETWORK, "")
+    flags: dict[Path, tuple[object, ...]] = {
+        capture / "objects.json": (args.objects, args.objects_frame),
+        capture / "people.json": (args.people_masks,),
+        capture / "keypoints.npz": (joints,),
+        capture / "camera.json": (args.camera, args.fov, args.tilt, args.camera_height),
+    }
+    stamp, made = _stamp(args.source), capture / "objects.json"
+    made_from = [stamp, repr(config), *(chain.digest_of(given) for given in flags.values())]
+
+    def work() -> None:
+        keep = [f.name for f in flags if steps.stays(STEPS[0], f, flags[f], stamp)]
+        with steps.writing(*flags):
+            _pictures(args, config, capture, finders, keep)
+
+    removed = [file for file in flags if steps.changed(file) and not file.exists()]
+    steps.do(STEPS[0], made_from, (removed or [made])[0], work, of=stamp)
+    return made
+
+
+def _stamp(source: Path, capture: Path | None = None) -> str:
+    """Which video it is; with a capture, under which lens."""
+    from mover.perceive.video import stamp_of
+
+    lens = () if capture is None else (lens_in(capture),)
+    return str((str(source.resolve()), *stamp_of(source), *lens))
+
+
 def _pictures(
-    args: VideoArgs, config: PerceiveConfig, capture: Path, finders: "Finders | None"
-) -> None:
-    """All of the capture but bodies and the first scene."""
+    args: VideoArgs, config: PerceiveConfig, capture: Path, finders: "Finders | None",
+    keep: Sequence[str],
+) -> None:  # fmt: skip
+    """All of the capture but bodies, the first scene and what the user replaced."""
     import torch
 
     from mover.app.cli.progress import Bar
@@ -248,9 +276,10 @@ def _pictures(
     from mover.perceive.capture import Finders, perceive
 
     torch.set_num_threads(THREADS)
+    video = replace(_video(args, capture), keep=tuple(keep))
     with Bar() as bar:
         run = Run(capture / "perceived", bar)
-        perceive(_video(args, capture), capture, config, run, say, finders or Finders())
+        perceive(video, capture, config, run, say, finders or Finders())
     say(f"{capture}: wrote frames/, reference.png, objects.json, people.json, camera.json")
 
 
@@ -303,7 +332,8 @@ def _bodies(capture: Path, args: VideoArgs, steps: chain.Steps) -> None:
         say("warning: no keypoints were found, so there are no bodies")
         steps.undo(STEPS[1], made)
         return
-    chain.write_heights(capture, args.height)
+    with steps.writing(capture / "people.json"):
+        chain.write_heights(capture, args.height)
     given = [] if args.bodies == chain.FIT or chain.OUT in args.bodies else [Path(args.bodies)]
     made_from = [keypoints, lens_in(capture), args.bodies, args.bodies_tool, *given]
     made_from += map(str, args.height)
@@ -315,7 +345,8 @@ def _bodies(capture: Path, args: VideoArgs, steps: chain.Steps) -> None:
         else:
             chain.import_bodies(args.bodies, args.bodies_tool, args.source, capture)
 
-    steps.do(STEPS[1], made_from, made, work, yours=args.bodies == chain.FIT)
+    of = _stamp(args.source, capture)
+    steps.do(STEPS[1], made_from, made, work, yours=args.bodies == chain.FIT, of=of)
 
 
 def _first_scene(capture: Path, args: VideoArgs, steps: chain.Steps) -> None:
@@ -328,8 +359,13 @@ def _first_scene(capture: Path, args: VideoArgs, steps: chain.Steps) -> None:
     made_from += [str(args.meshes), str((args.tilt, args.camera_height))]
     made_from += [] if own is None else [own[0]]
     asked = LayoutArgs(capture, args.depth, args.meshes)
-    made = capture / "scene.json"
-    steps.do(STEPS[2], made_from, made, lambda: layout_into(asked, LayoutConfig()), yours=True)
+
+    def work() -> None:
+        with steps.writing(capture / "camera.json"):
+            layout_into(asked, LayoutConfig())
+
+    of = _stamp(args.source, capture)
+    steps.do(STEPS[2], made_from, capture / "scene.json", work, yours=True, of=of)
 
 
 def lens_in(capture: Path) -> str:
