@@ -190,7 +190,8 @@ def test_joints_masks_and_outlines_in_pixels_of_a_swaying_video_are_carried_alon
         film, fov=60.0, keypoints=lambda: tmp_path / "joints.json", masks=tmp_path / "masks.json",
         objects=tmp_path / "chair.json", objects_frame=4,
     )  # fmt: skip
-    perceive(video, out, PerceiveConfig(), Run(out / "perceived"), said.append, NO_FINDERS)
+    rest = PerceiveConfig(), Run(out / "perceived"), said.append, NO_FINDERS
+    perceive(video, out, *rest)
     (reference,) = re.findall(r"sways .* onto frame (\d+)", "\n".join(said))
     at = SWAY[int(reference)]
     found = read_keypoints(out / "keypoints.npz")
@@ -208,9 +209,25 @@ def test_joints_masks_and_outlines_in_pixels_of_a_swaying_video_are_carried_alon
     assert read_picture_of(out).reference is not None
     (row,) = rows(out, "objects.json")
     assert row["bbox"] == pytest.approx([W - 34 + 5 - at[0], H - 40 + 2 - at[1], 24, 28], abs=1.5)
+    whole = {"segmentation": [[0, 0, W, 0, W, H, 0, H]]}
+    (tmp_path / "full.json").write_text(
+        json.dumps({**masks, "annotations": [{**row, **whole} for row in people]})
+    )
+    with pytest.raises(InputError, match=r"full\.json: masks cover 100% .* invert them"):
+        perceive(replace(video, masks=tmp_path / "full.json"), out, *rest)
+    for zoom, shift, words in (
+        (0.5, 0, rf"masks\.json, .* of about 6\d x (4[6-9]|50) pixels: .* of {W} x {H}"),
+        (1, 60, r"masks\.json, .* both of this video, and their frames counted from 0"),
+    ):
+        points = [np.reshape(row["keypoints"], (-1, 3)) * (zoom, zoom, 1) for row in joints]
+        points = [np.add(xy, (shift, 0, 0)).tolist() for xy in points]
+        other = [{**row, "keypoints": p} for row, p in zip(joints, points, strict=True)]
+        (tmp_path / "joints.json").write_text(json.dumps(other))
+        with pytest.raises(InputError, match=words):
+            perceive(video, out, *rest)
     (tmp_path / "joints.json").write_text(json.dumps([{**joints[0], "image_id": 1}]))
     with pytest.raises(InputError, match=r"none of the frames .* expected 0, 2, 4, 6"):
-        perceive(video, out, PerceiveConfig(), Run(out / "perceived"), print, NO_FINDERS)
+        perceive(video, out, *rest)
 
 
 def test_without_a_network_for_furniture_all_else_is_written_and_the_outlines_are_asked_for(

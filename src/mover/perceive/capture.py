@@ -243,7 +243,7 @@ def people_of_clip(
     if joints is None and config.models.keypoints and tracks.masks.counts:
         joints = run.stage(finders.joints, JointsInputs(clip, tracks), config.models)
     if joints is not None and not (video.keypoints is None and video.masks is None):
-        joints = same_people(joints, tracks)
+        joints = same_people(joints, tracks, video)
     return tracks, joints
 
 

@@ -4,6 +4,7 @@ Files count frames and pixels as in the video; both are carried to the frames th
 steadied camera sees them.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +17,7 @@ from torch import Tensor
 
 from mover.core.errors import InputError
 from mover.core.types import Keypoints, Masks, People
-from mover.geometry.rle import decode, encode
+from mover.geometry.rle import area, decode, encode, mask_boxes
 from mover.io.formats import names
 from mover.io.masks.instance_files import read_people, read_things
 from mover.io.masks.instances import Instance, Instances
@@ -27,6 +28,9 @@ from mover.perceive.video import Clip
 
 Say = Callable[[str], None]
 FEW = 0.5  # share of the frames: with fewer in a file the user is warned
+HARDLY, FITS = 0.1, 0.8  # share of joints in masks: of other people; of the same people
+MOST = 0.5  # of the picture that a person covers
+BARE = 2.0  # joints from 0 to 1 are below
 
 
 @dataclass(frozen=True)
@@ -114,7 +118,14 @@ def own_masks(path: Path, clip: Clip, drift: Drift, say: Say) -> People:
             codes.append(encode(mask))
             kept.append(k)
     person = torch.tensor([items[rows[k]].track or 0 for k in kept], dtype=torch.long)
-    return People(Masks(clip.height, clip.width, tuple(codes)), at[kept], person)
+    masks = Masks(clip.height, clip.width, tuple(codes))
+    areas = [area(masks, k) / (clip.height * clip.width) for k in range(len(codes))]
+    if areas and (usual := float(np.median(areas))) > MOST:
+        raise InputError(
+            f"{path.name}: masks cover {usual:.0%} of the picture in most frames, expected those "
+            "of people: they are inverted (the room is set), so invert them"
+        )
+    return People(masks, at[kept], person)
 
 
 def own_objects(video: Video, clip: Clip, drift: Drift) -> dict[str, Any]:
@@ -178,20 +189,56 @@ def _taken(
     return torch.tensor(rows), torch.tensor(at)
 
 
-def same_people(keypoints: Keypoints, tracks: People) -> Keypoints:
-    """The joints under the numbers of the masks that hold most of them; others are numbered on."""
+def same_people(keypoints: Keypoints, tracks: People, video: Video) -> Keypoints:
+    """The joints under the numbers of the masks that hold most of them; others are numbered on.
+
+    Raises:
+        InputError: If hardly any joint lies in a mask.
+    """
     from scipy.optimize import linear_sum_assignment
 
     people, masks = keypoints.person.unique().tolist(), tracks.person.unique().tolist()
-    votes = np.zeros((len(people), len(masks)))
+    votes, share = _held(keypoints, tracks)
+    if share < FEW and (found := _apart(keypoints, tracks, video, share)):
+        raise InputError(found)
+    pairs = zip(*linear_sum_assignment(-votes), strict=True)
+    number = {people[i]: masks[j] for i, j in pairs if votes[i, j] > 0}
+    others = [person for person in people if person not in number]
+    number |= {person: max([*masks, -1]) + 1 + k for k, person in enumerate(others)}
+    return replace(keypoints, person=torch.tensor([number[p] for p in keypoints.person.tolist()]))
+
+
+def _held(keypoints: Keypoints, tracks: People) -> tuple[Float[np.ndarray, "people masks"], float]:
+    """Joints of each person that each track of masks holds, and the share that any mask holds."""
+    people, masks = keypoints.person.unique().tolist(), tracks.person.unique().tolist()
+    votes, most = np.zeros((len(people), len(masks))), dict[int, tuple[int, int]]()
     for k, row in (keypoints.frame[:, None] == tracks.frame).nonzero().tolist():
         mask = decode(tracks.masks, row)
         x, y = keypoints.points[k][keypoints.confidence[k] > 0].long().unbind(-1)
         inside = mask[y.clamp(0, mask.shape[0] - 1), x.clamp(0, mask.shape[1] - 1)]
         pair = people.index(int(keypoints.person[k])), masks.index(int(tracks.person[row]))
         votes[pair] += int(inside.sum())
-    pairs = zip(*linear_sum_assignment(-votes), strict=True)
-    number = {people[i]: masks[j] for i, j in pairs if votes[i, j] > 0}
-    others = [person for person in people if person not in number]
-    number |= {person: max([*masks, -1]) + 1 + k for k, person in enumerate(others)}
-    return replace(keypoints, person=torch.tensor([number[p] for p in keypoints.person.tolist()]))
+        most[k] = max(most.get(k, (0, 0)), (int(inside.sum()), len(x)))
+    held, joints = np.array([*most.values(), (0, 0)]).sum(0)
+    return votes, held / joints if joints else 1.0
+
+
+def _apart(keypoints: Keypoints, tracks: People, video: Video, share: float) -> str:
+    """Why joints lie beside the masks: another size, other frames; empty: they do not."""
+    sure = (keypoints.confidence > 0)[..., None]
+    same = (keypoints.frame[:, None] == tracks.frame) & sure.any(1)
+    k, row = same.nonzero().unbind(-1)
+    low, high = (keypoints.points.masked_fill(~sure, far) for far in (math.inf, -math.inf))
+    middle = (low.amin(1) + high.amax(1))[k] / 2
+    boxes = mask_boxes(tracks.masks)[row]
+    zoom = (middle * (boxes[:, :2] + boxes[:, 2:]) / 2).sum() / middle.square().sum()
+    size = torch.tensor([tracks.masks.width, tracks.masks.height])
+    zoom = size if keypoints.points.amax() < BARE else zoom.expand(2)
+    why = "are both of this video, and their frames counted from 0 as in it?"
+    if _held(replace(keypoints, points=keypoints.points * zoom), tracks)[1] > FITS:
+        (w, h), (width, height) = (size / zoom).round().int().tolist(), size.tolist()
+        why = f"they fit in pictures of about {w} x {h} pixels: give those of {width} x {height}"
+    elif share > HARDLY:
+        return ""
+    masks = "people's masks" if video.masks is None else f"the masks of {video.masks.name}"
+    return f"--keypoints: {share:.0%} of the joints lie in {masks}, expected most of them; {why}"
