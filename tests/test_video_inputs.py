@@ -40,7 +40,7 @@ from mover.perceive.capture import Finders, perceive, read_picture_of
 from mover.perceive.config import FramesConfig, PerceiveConfig
 from mover.perceive.mediapipe import PoseInputs
 from mover.perceive.networks import Finds, link_people
-from mover.perceive.own import Video
+from mover.perceive.own import Video, swaps
 from mover.perceive.video import Clip
 
 pytest.importorskip("cv2")
@@ -230,6 +230,41 @@ def test_joints_masks_and_outlines_in_pixels_of_a_swaying_video_are_carried_alon
         perceive(video, out, *rest)
 
 
+def test_files_that_count_frames_at_another_rate_are_taken_by_their_rate_or_refused(tmp_path: Path):
+    """So what a capture has may be handed in again with its video."""
+    film = filmed(tmp_path / "v.mp4", Shot(), range(0, 57, 3))  # ten a second
+    first, said = perceived(film, tmp_path / "c"), list[str]()
+    file, out = first / "keypoints.npz", tmp_path / "d"
+    video = Video(film, fov=60.0, keypoints=lambda: file, masks=first / "people.json")
+    perceive(video, out, PerceiveConfig(), Run(out / "perceived"), said.append, FINDERS)
+    one, other = (read_keypoints(c / "keypoints.npz") for c in (first, out))
+    assert torch.equal(one.frame, other.frame)
+    assert (one.points - other.points).abs().max() < 2  # who walks goes 2.4 px a frame
+    shown = [[row["image_id"] for row in rows(c, "people.json")] for c in (first, out)]
+    assert shown[0] == shown[1] == one.frame.tolist()
+    what = "has 'fps' 5, expected 10 as in v.mp4: frame 1 of it is taken as frame 2 of the video"
+    for name in ("keypoints.npz", "people.json"):
+        assert f"warning: {name}: {what}" in said
+    file = tmp_path / "other.npz"
+    write_keypoints(replace(one, fps=7.0), file)
+    with pytest.raises(InputError, match=r"other\.npz: has 'fps' 7, expected 10 .* number frames"):
+        perceive(video, out, PerceiveConfig(), Run(out / "perceived"), print, FINDERS)
+
+
+def test_people_whose_numbers_are_exchanged_are_said_with_the_frame():
+    """Not such as pass each other, or as stand where they cannot be told apart."""
+    frame = torch.arange(6).repeat_interleave(2)
+    x = torch.tensor([[0.0, 200.0 - 20 * k] for k in range(6)])  # one walks to the other
+    place = torch.stack([x, torch.zeros_like(x)], -1).flatten(0, 1)
+    points = place[:, None] + torch.from_numpy(100 * FIGURE).float()
+    person = torch.tensor([0, 1] * 3 + [1, 0] * 3)
+    joints = Keypoints(points, torch.ones(12, 17), "coco17", frame, person, 5.0)
+    assert swaps(joints) == [("0 and 1", 3)]
+    assert swaps(replace(joints, person=torch.tensor([0, 1] * 6))) == []
+    near = replace(joints, points=points * torch.tensor([0.05, 1.0]))
+    assert swaps(near) == []
+
+
 def test_without_a_network_for_furniture_all_else_is_written_and_the_outlines_are_asked_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -293,6 +328,12 @@ def test_a_camera_that_moves_is_said(tmp_path: Path, capsys: pytest.CaptureFixtu
     told = capsys.readouterr().out
     assert "warning: the camera moves" in told
     assert "one that stands still" in told
+
+
+def test_people_who_are_found_in_few_frames_may_be_in_the_room_and_that_is_said(tmp_path, capsys):
+    pictures = [Shot(person=k < 4).at(k / 5) for k in range(10)]
+    perceived(write_film(tmp_path / "v.mp4", pictures, range(0, 60, 6)), tmp_path / "c")
+    assert "warning: people are found in 4 of 10 frames" in capsys.readouterr().out
 
 
 def test_a_video_without_furniture_ends_with_one_sentence(tmp_path: Path):

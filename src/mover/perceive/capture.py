@@ -50,7 +50,7 @@ from mover.perceive.config import ModelsConfig, PerceiveConfig
 from mover.perceive.layout import FirstScene, Picture
 from mover.perceive.mediapipe import PoseInputs, find_poses
 from mover.perceive.networks import Finds, JointsInputs
-from mover.perceive.own import Say, Video, own_keypoints, own_masks, own_objects, same_people
+from mover.perceive.own import FEW, Say, Video, own_keypoints, own_masks, own_objects, same_people
 from mover.perceive.reference import Clean, detections_in, hidden_mask, reference_of
 from mover.perceive.steady import Drift, find_drift, steady_frames, warnings_of
 from mover.perceive.video import (
@@ -126,12 +126,7 @@ def perceive(
         if outlines is not None:
             tracks = mediapipe.without_furniture(tracks, joints, outlines)
             clean = reference_of(clip, drift, tracks)
-    unseen = 100 * float(clean.hidden.float().mean())
-    count = len(tracks.person.unique())
-    say(
-        f"people: {count}, {len(tracks.frame)} masks; {unseen:.1f} % of the room are never seen "
-        "without a person"
-    )
+    say(people_found(tracks, clip, clean))
     write_image(clean.picture, out / "reference.png")
     if not own:
         given = {name: at.value[name] for name in LENS_FIELDS if at.value.get(name) is not None}
@@ -142,6 +137,22 @@ def perceive(
         raise lacking
     if "objects.json" not in keep:
         write_json(objects, out / "objects.json")
+
+
+def people_found(tracks: People, clip: Clip, clean: Clean) -> str:
+    """What is said of the people, with a warning where most frames have none."""
+    unseen, seen = 100 * float(clean.hidden.float().mean()), len(tracks.frame.unique())
+    said = (
+        f"people: {len(tracks.person.unique())}, {len(tracks.frame)} masks; {unseen:.1f} % of the "
+        "room are never seen without a person"
+    )
+    if not 0 < seen < FEW * len(clip.time):
+        return said
+    return (
+        f"{said}\nwarning: people are found in {seen} of {len(clip.time)} frames: if some were "
+        "missed in the others, reference.png may show them as part of the room; --people-masks "
+        "FILE of another tool or a closer view helps"
+    )
 
 
 def write_people(
@@ -182,7 +193,7 @@ def moving_people(
         enough = video.keypoints is not None or faster <= (clip.fps or 0.0)
         if joints is None or enough or not restless(joints):
             return clip, drift, tracks, joints
-        say(f"people move fast: {faster:g} frames a second are taken")
+        say(f"people move fast: {faster:.3g} frames a second are taken")
         config = replace(config, frames=replace(config.frames, fps=faster))
 
 
@@ -234,7 +245,7 @@ def people_of_clip(
     if video.mediapipe:
         tracks, joints = run.stage(finders.poses, mediapipe.pose_inputs(clip), None)
     if video.masks is not None:
-        tracks = own_masks(video.masks, clip, drift, say)
+        tracks = own_masks(video, clip, drift, say)
     elif tracks is None:
         starts = range(0, len(clip.time), CHUNK)
         parts = [run.stage(finders.instances, clip.part(k, k + CHUNK), config) for k in starts]

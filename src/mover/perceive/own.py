@@ -23,13 +23,16 @@ from mover.io.masks.instance_files import read_people, read_things
 from mover.io.masks.instances import Instance, Instances
 from mover.io.people.found import Known
 from mover.io.people.keypoints import keypoints_from, read_keypoints
+from mover.perceive.config import FramesConfig
 from mover.perceive.steady import Drift, moved, warp
-from mover.perceive.video import Clip
+from mover.perceive.video import Clip, rate_of
 
 Say = Callable[[str], None]
 FEW = 0.5  # share of the frames: with fewer in a file the user is warned
 HARDLY, FITS = 0.1, 0.8  # share of joints in masks: of other people; of the same people
 MOST = 0.5  # of the picture that a person covers
+FAR = 3.0  # times as far as another person: who jumps so has another's number
+SAME_RATE, UNEVEN = 0.01, 0.1  # difference of two rates of frames; of the mean of an uneven video
 BARE = 2.0  # joints from 0 to 1 are below
 
 
@@ -74,14 +77,45 @@ def own_keypoints(video: Video, clip: Clip, drift: Drift, say: Say) -> Keypoints
     path = video.keypoints()
     found = _read_joints(path)
     frames = clip.numbers if video.of_frames else clip.in_source
-    rows, at = _taken(found.frame, frames, path, say)
+    counted = found.frame if video.of_frames else _counted(found.frame, found.fps, video, path, say)
+    rows, at = _taken(counted, frames, path, say)
     points = found.points[rows]
     if not video.of_frames and drift.verdict != "still":
         for k, frame in enumerate(at.tolist()):
             points[k] = torch.from_numpy(
                 moved(np.linalg.inv(drift.H[frame].double().numpy()), points[k].numpy())
             )
-    return Keypoints(points, found.confidence[rows], found.layout, at, found.person[rows], clip.fps)
+    sure, person = found.confidence[rows], found.person[rows]
+    joints = Keypoints(points, sure, found.layout, at, person, clip.fps)
+    for who, frame in swaps(joints) if clip.fps else ():
+        say(
+            f"warning: {path.name}: persons {who} change places at frame {int(frames[frame])}, "
+            "expected one number for each person: correct them from there on"
+        )
+    return joints
+
+
+def swaps(joints: Keypoints) -> list[tuple[str, int]]:
+    """People who are far nearer to where others of them were one frame before, and that frame."""
+    from scipy.optimize import linear_sum_assignment
+
+    sure = (joints.confidence > 0)[..., None]
+    middle = (joints.points * sure).sum(1) / sure.sum(1).clamp_min(1)
+    tall = ((joints.points - middle[:, None]) * sure).norm(dim=-1).amax(1)
+    found = list[tuple[str, int]]()
+    for frame in joints.frame.unique().tolist():
+        rows = [(joints.frame == k).nonzero()[:, 0].tolist() for k in (frame - 1, frame)]
+        before, now = ({int(joints.person[row]): row for row in some} for some in rows)
+        people = sorted(before.keys() & now.keys())
+        old = [before[who] for who in people]
+        way = torch.cdist(middle[old], middle[[now[who] for who in people]])
+        nearest = torch.from_numpy(linear_sum_assignment(way)[1])
+        other = nearest != torch.arange(len(people))
+        jump, step = way.diagonal()[other], way.gather(1, nearest[:, None])[other, 0]
+        if (2 * jump > tall[old][other]).any() and jump.sum() > FAR * step.sum():
+            names = [str(who) for who, one in zip(people, other, strict=True) if one]
+            found.append((" and ".join(names), frame))
+    return found
 
 
 def _read_joints(path: Path) -> Keypoints:
@@ -97,18 +131,20 @@ def _read_joints(path: Path) -> Keypoints:
     raise InputError(f"{first}; known are keypoints.npz and {', '.join(names('keypoints'))}")
 
 
-def own_masks(path: Path, clip: Clip, drift: Drift, say: Say) -> People:
+def own_masks(video: Video, clip: Clip, drift: Drift, say: Say) -> People:
     """People's masks of the frames that are taken, as the steadied camera sees them.
 
     Raises:
         InputError: If the file cannot be read, has another size, or none of these frames.
     """
-    size = clip.width, clip.height
+    assert video.masks is not None
+    path, size = video.masks, (clip.width, clip.height)
     found = read_people(path, {}, size)
     for note in found.notes:
         say(f"note: {note}")
     items = [item for item in found.items if item.mask is not None]
     frames = torch.tensor([item.frame for item in items], dtype=torch.long)
+    frames = _counted(frames, found.fps, video, path, say)
     rows, at = _taken(frames, clip.in_source, path, say)
     codes, kept = list[bytes](), list[int]()
     for k, (row, frame) in enumerate(zip(rows.tolist(), at.tolist(), strict=True)):
@@ -167,6 +203,26 @@ def _carried(mask: Bool[Tensor, "h w"], H: Float[Tensor, "3 3"]) -> Bool[Tensor,
     return torch.from_numpy(warp(pixels, H.double().numpy(), mask.shape) > 0.5)
 
 
+def _counted(
+    frames: Int[Tensor, " rows"], fps: float | None, video: Video, path: Path, say: Say
+) -> Int[Tensor, " rows"]:
+    """Frames of the video from those of a file that has another rate; -1: there is none.
+
+    Raises:
+        InputError: If the two rates are no whole multiples.
+    """
+    rate = None if fps is None else rate_of(video.source, FramesConfig(fps=0.0))
+    if rate is None or fps is None or abs(fps / rate - 1) < SAME_RATE:
+        return frames
+    found = f"{path.name}: has 'fps' {fps:g}, expected {rate:g} as in {video.source.name}"
+    more, less = round(max(rate / fps, 1)), round(max(fps / rate, 1))
+    off = abs(fps * more / less / rate - 1)
+    if off > (SAME_RATE if more * less > 1 else UNEVEN):
+        raise InputError(f"{found}: number frames as in the video, or leave 'fps' away")
+    say(f"warning: {found}: frame {less} of it is taken as frame {more} of the video")
+    return torch.where(frames % less == 0, frames * more // less, -1)
+
+
 def _taken(
     frames: Int[Tensor, " rows"], wanted: Int[Tensor, " frames"], path: Path, say: Say
 ) -> tuple[Int[Tensor, " kept"], Int[Tensor, " kept"]]:
@@ -185,7 +241,11 @@ def _taken(
             "(from 0; --frames.fps takes others)"
         )
     if len(set(at)) < FEW * len(place):
-        say(f"warning: {path.name} has {len(set(at))} of the {len(place)} frames that are taken")
+        say(
+            f"warning: {path.name} has {len(set(at))} of the {len(place)} frames that are taken: "
+            f"its last is {int(frames.max())}, that of the video {int(wanted[-1])}; if it has only "
+            "every n-th, number them as in the video, from 0"
+        )
     return torch.tensor(rows), torch.tensor(at)
 
 

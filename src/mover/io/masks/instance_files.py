@@ -10,7 +10,7 @@ from msgspec import Struct, field
 
 from mover.core.errors import InputError
 from mover.io.capture.parts import UNKNOWN, Hints, Parts
-from mover.io.files.fields import LAST_INDEX, At, read_json
+from mover.io.files.fields import FASTEST, LAST_INDEX, SLOWEST, At, read_json
 from mover.io.files.images import image_size
 from mover.io.files.schema import Id, Index, Share, Side, Text, checked
 from mover.io.masks.coco import COCO_CLASSES, COCO_IDS, MOST_THINGS, CategoryFields, is_drawn
@@ -275,7 +275,10 @@ def coco_instances(
     if len(set(sizes.values())) > 1:
         at.get("images").refuse("images of one size", f"{len(set(sizes.values()))} sizes")
     looked, own = frozenset(frames.values()), next(iter(sizes.values()), size)
-    return Instances(tuple(found), own, at.file, looked, (*notes, *more))
+    info = at.maybe("info")
+    rate = info.maybe("fps") if info is not None and isinstance(info.value, dict) else None
+    fps = None if rate is None else rate.number(SLOWEST, FASTEST)
+    return Instances(tuple(found), own, at.file, looked, (*notes, *more), fps)
 
 
 def _ours(

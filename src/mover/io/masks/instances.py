@@ -61,6 +61,8 @@ class Instances:
     """Those that were looked at, with things in them or without."""
     notes: tuple[str, ...] = ()
     """What was decided that the source does not say."""
+    fps: float | None = None
+    """Frames a second, where the source has a rate."""
 
     def fitted(self, size: Size | None) -> "Instances":
         """The instances in an image of this size, resampled where theirs has the same shape."""
