@@ -40,7 +40,8 @@ from mover.perceive.capture import Finders, perceive, read_picture_of
 from mover.perceive.config import FramesConfig, PerceiveConfig
 from mover.perceive.mediapipe import PoseInputs
 from mover.perceive.networks import Finds, link_people
-from mover.perceive.own import Video, swaps
+from mover.perceive.own import Video, own_objects, swaps
+from mover.perceive.steady import Drift
 from mover.perceive.video import Clip
 
 pytest.importorskip("cv2")
@@ -263,6 +264,32 @@ def test_people_whose_numbers_are_exchanged_are_said_with_the_frame():
     assert swaps(replace(joints, person=torch.tensor([0, 1] * 6))) == []
     near = replace(joints, points=points * torch.tensor([0.05, 1.0]))
     assert swaps(near) == []
+
+
+@pytest.mark.parametrize(("boxes", "frame", "words"), [
+    ([(0.2, 0.3, 0.4, 0.5)], None, "REFUSED o.json: .* has a box from 0 to 1, expected pixels"),
+    ([(200, 9, 20, 20)], None, "REFUSED o.json: object chair outside the picture of 128 x 96"),
+    ([(9, 9, 20, 20), (200, 9, 20, 20)], None, "warning: o.json: object chair outside .* left out"),
+    ([(9, 9, 20, 90)], None, "warning: o.json: outline chair beyond the picture, cut"),
+    ([(9, 9, 20, 20)], 9999, "REFUSED --objects-frame: has 9999, expected .* 0 to 2"),
+    ([(9, 9, 20, 20)], 3, "^$"),
+])  # fmt: skip
+def test_outlines_beyond_the_picture_or_of_a_frame_beyond_the_video_are_said(
+    tmp_path: Path, boxes: list[tuple[float, ...]], frame: int | None, words: str
+):
+    rows = [{"image_id": 0, "category_id": 1, "bbox": box} for box in boxes]
+    tree = {"images": [{"id": 0, "width": W, "height": H}], "annotations": rows}
+    names = {"categories": [{"id": 1, "name": "chair"}]}
+    (tmp_path / "o.json").write_text(json.dumps({**tree, **names}))
+    clip = Clip("", W, H, torch.arange(3) / 5, 5.0)
+    drift = Drift(torch.eye(3).repeat(3, 1, 1), torch.ones(3), 0, 0.0, "still")
+    video, said = Video(tmp_path, objects=tmp_path / "o.json", objects_frame=frame), list[str]()
+    try:
+        (row,) = own_objects(video, clip, drift, said.append)["annotations"]
+        assert row["bbox"] == pytest.approx([9, 9, 20, min(boxes[0][3], H - 9)])
+    except InputError as error:
+        said = [f"REFUSED {error}"]
+    assert re.search(words, "\n".join(said))
 
 
 def test_without_a_network_for_furniture_all_else_is_written_and_the_outlines_are_asked_for(

@@ -114,7 +114,7 @@ def perceive(
     kept = read_json(out / "objects.json").value if "objects.json" in keep else None
     try:
         if kept is not None or video.objects is not None:
-            objects = own_objects(video, clip, drift) if kept is None else kept
+            objects = own_objects(video, clip, drift, say) if kept is None else kept
         else:
             objects = furniture_in(clean, camera, config, run, finders, out)
     except InputError as error:  # all else is written

@@ -18,6 +18,7 @@ from torch import Tensor
 from mover.core.errors import InputError
 from mover.core.types import Keypoints, Masks, People
 from mover.geometry.rle import area, decode, encode, mask_boxes
+from mover.io.files.fields import listed
 from mover.io.formats import names
 from mover.io.masks.instance_files import read_people, read_things
 from mover.io.masks.instances import Instance, Instances
@@ -164,23 +165,50 @@ def own_masks(video: Video, clip: Clip, drift: Drift, say: Say) -> People:
     return People(masks, at[kept], person)
 
 
-def own_objects(video: Video, clip: Clip, drift: Drift) -> dict[str, Any]:
+def own_objects(video: Video, clip: Clip, drift: Drift, say: Say) -> dict[str, Any]:
     """The fields of objects.json from outlines or boxes.
 
     Raises:
-        InputError: If the file cannot be read, has another size or no object.
+        InputError: If the file cannot be read, has another size or no object in the picture, or the
+            frame is not of the shot.
     """
     assert video.objects is not None
+    name = video.objects.name
     size = clip.width, clip.height
     found = read_things(video.objects, {}, size, "reference.png")
+    for note in found.notes:
+        say(f"note: {note}")
     items = list(found.items)
     if not items:
-        raise InputError(f"{video.objects.name}: has no furniture, expected outlines or boxes")
+        raise InputError(f"{name}: has no furniture, expected outlines or boxes")
     if video.objects_frame is not None:
-        frame = int((clip.in_source - video.objects_frame).abs().argmin())
+        off, frame = (clip.in_source - video.objects_frame).abs().min(0)
+        if off > clip.in_source.diff().amax() if len(clip.time) > 1 else off > 0:
+            raise InputError(
+                f"--objects-frame: has {video.objects_frame}, expected a frame that is taken of "
+                f"the video, {int(clip.in_source[0])} to {int(clip.in_source[-1])}"
+            )
         items = [_moved_item(item, drift.H[frame], size) for item in items]
-    tree = Instances(tuple(items), size, found.file).objects_tree().value
+    whole = [replace(item, box=_within(item.box, size)) for item in items]
+    if cut := [a.category for a, b in zip(items, whole, strict=True) if a.box != b.box]:
+        say(f"warning: {name}: {listed('outline', cut)} beyond the picture, cut at its border")
+    tree = Instances(tuple(whole), size, found.file).objects_tree().value
+    inside = {row["id"] for row in tree["annotations"]}
+    if lost := [item.category for k, item in enumerate(whole) if k not in inside]:
+        text = (
+            f"{name}: {listed('object', lost)} outside the picture of {size[0]} x {size[1]} pixels"
+        )
+        if not inside:
+            raise InputError(f"{text}, expected outlines in reference.png or a frame")
+        say(f"warning: {text}, left out")
     return {**tree, "images": [{**tree["images"][0], "file_name": "reference.png"}]}
+
+
+def _within(box: tuple[float, ...] | None, size: tuple[int, int]) -> tuple[float, ...] | None:
+    """A box cut at the border of a picture, unless it is beyond by a pixel at most."""
+    if box is None or (np.clip(box, -1, np.add(size * 2, 1)) == box).all():
+        return box
+    return tuple(np.clip(box, 0, size * 2).tolist())
 
 
 def _moved_item(item: Instance, H: Float[Tensor, "3 3"], size: tuple[int, int]) -> Instance:
