@@ -348,6 +348,24 @@ def test_of_a_video_that_is_cut_the_longest_shot_is_used_and_said(tmp_path, caps
     assert np.abs(clean - empty)[:, 70:90].mean() < 12
 
 
+def test_black_frames_at_the_start_are_no_shots(tmp_path, capsys):
+    pictures = [np.zeros((H, W, 3), np.uint8)] * 3 + [Shot().at(k / 5) for k in range(3, 14)]
+    perceived(write_film(tmp_path / "v.mp4", pictures, range(0, 84, 6)), tmp_path / "c")
+    said = next(line for line in capsys.readouterr().out.splitlines() if "is cut at" in line)
+    assert said.endswith(
+        "is cut at 0.6 s: the method needs one shot, and the longest is used, 0.6 to 2.6 s"
+    )
+
+
+def test_a_video_that_is_cut_off_or_of_another_kind_says_so(tmp_path: Path):
+    film = filmed(tmp_path / "v.mp4", Shot(), range(0, SECOND, 3))
+    for name, data in (("cut.mp4", film.read_bytes()[:900]), ("text.mp4", b"no video")):
+        (tmp_path / name).write_bytes(data)
+        words = rf"^{name}: cannot be read \(it is unfinished, damaged or of another kind: copy it"
+        with pytest.raises(InputError, match=words):
+            take(tmp_path / name, tmp_path / "f")
+
+
 def test_a_camera_that_moves_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     times = range(0, 3 * SECOND, 6)
     pictures = [Shot(look=(4 * k, 2 * k), chair=False).at(0) for k in range(len(times))]

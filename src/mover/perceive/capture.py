@@ -335,9 +335,10 @@ def lens_of(
     known = None if photo is None else camera_of_photo(photo, size)
     if known is not None:
         return known, None
+    who = "" if photo is None else f" ({photo.name} has no focal length)"
     text = (
-        f"the lens is not known: {USUAL:.0f} degrees across are assumed; give --camera FILE or "
-        "--fov DEGREES (GeoCalib, MoGe and others estimate both lens and tilt)"
+        f"the lens is not known{who}: {USUAL:.0f} degrees across are assumed; give --camera FILE "
+        "or --fov DEGREES (GeoCalib, MoGe and others estimate both lens and tilt)"
     )
     return with_spread(of_view(USUAL, size, "assumed"), ASSUMED), text
 

@@ -163,7 +163,7 @@ class VideoArgs:
     bodies_tool: str = ""
     """What wrote FILE, or what COMMAND writes: a TOOL of `mover import-bodies`; empty: bodies.npz
     itself."""
-    height: tuple[Annotated[float, float_in(0.4, 2.6)], ...] = ()
+    height: tuple[Annotated[float, float_in(0.4, 2.6, "metres")], ...] = ()
     """How tall people are, one for all or for each in the order of their numbers [m]: gives
     `--bodies fit` and the room how far they are."""
     camera: Path | None = None
@@ -218,6 +218,8 @@ def video_to_room(
         say(ONE_IMAGE)
     capture, steps = args.out / "capture", chain.steps_in(args.out, say, STEPS)
     made = _taken(args, config, capture, steps, finders)
+    if not pictures and len([*(capture / "frames").iterdir()]) == 1:
+        say(ONE_IMAGE)
     if not json.loads(made.read_text())["annotations"]:
         raise InputError(
             f"{capture / 'reference.png'}: the network finds no furniture in it, so there is "
