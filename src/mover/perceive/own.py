@@ -189,8 +189,13 @@ def own_objects(video: Video, clip: Clip, drift: Drift, say: Say) -> dict[str, A
                 f"the video, {int(clip.in_source[0])} to {int(clip.in_source[-1])}"
             )
         items = [_moved_item(item, drift.H[frame], size) for item in items]
-    whole = [replace(item, box=_within(item.box, size)) for item in items]
-    if cut := [a.category for a, b in zip(items, whole, strict=True) if a.box != b.box]:
+    whole, cut = list[Instance](), list[str]()
+    for item in items:
+        box = None if item.box is None else tuple(np.clip(item.box, 0, size * 2).tolist())
+        whole.append(replace(item, box=box))
+        if np.abs(np.subtract(item.box or 0, box or 0)).max() > 1:
+            cut.append(item.category)
+    if cut:
         say(f"warning: {name}: {listed('outline', cut)} beyond the picture, cut at its border")
     tree = Instances(tuple(whole), size, found.file).objects_tree().value
     inside = {row["id"] for row in tree["annotations"]}
@@ -202,13 +207,6 @@ def own_objects(video: Video, clip: Clip, drift: Drift, say: Say) -> dict[str, A
             raise InputError(f"{text}, expected outlines in reference.png or a frame")
         say(f"warning: {text}, left out")
     return {**tree, "images": [{**tree["images"][0], "file_name": "reference.png"}]}
-
-
-def _within(box: tuple[float, ...] | None, size: tuple[int, int]) -> tuple[float, ...] | None:
-    """A box cut at the border of a picture, unless it is beyond by a pixel at most."""
-    if box is None or (np.clip(box, -1, np.add(size * 2, 1)) == box).all():
-        return box
-    return tuple(np.clip(box, 0, size * 2).tolist())
 
 
 def _moved_item(item: Instance, H: Float[Tensor, "3 3"], size: tuple[int, int]) -> Instance:

@@ -282,7 +282,8 @@ def _pictures(
     with Bar() as bar:
         run = Run(capture / "perceived", bar)
         perceive(video, capture, config, run, say, finders or Finders())
-    say(f"{capture}: wrote frames/, reference.png, objects.json, people.json, camera.json")
+    names = ("frames/", "reference.png", "objects.json", "people.json", "camera.json")
+    say(f"{capture}: wrote {', '.join(name for name in names if name not in keep)}")
 
 
 def _check_needs(args: VideoArgs, config: PerceiveConfig) -> None:
