@@ -26,12 +26,12 @@ NAMES = ("first", "second")
 
 
 class TestSteps:
-    def do(self, folder: Path, word: str, yours: bool = False) -> list[str]:
+    def do(self, folder: Path, word: str, yours: bool = False, of: str = "") -> list[str]:
         """One step in a new process that writes a word, made from in.txt and the word."""
         lines, made = list[str](), folder / "made.txt"
         steps = steps_in(folder, lines.append, NAMES)
         steps.do("first", [folder / "in.txt", word], made, lambda: made.write_text(word) and None,
-                 yours=yours)  # fmt: skip
+                 yours=yours, of=of)  # fmt: skip
         return lines
 
     @pytest.mark.parametrize("yours", [False, True])
@@ -48,6 +48,8 @@ class TestSteps:
         if yours:  # what replaced a result outlives what it was made from
             assert lines == ["1/2 first: made.txt is yours and stays; without it, it is made"]
             assert made.read_text() == "user's"
+            (line,) = self.do(tmp_path, "two", yours, "another video")
+            assert "made.txt is yours and stays, though the video or its lens has changed" in line
         else:
             assert made.read_text() == "two"
         made.unlink()

@@ -34,13 +34,14 @@ from mover.core.types import Keypoints, Masks, People, Scene
 from mover.geometry.rle import decode, tight_box
 from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.scene_file import read_scene
-from mover.io.people.keypoints import read_keypoints
+from mover.io.people.keypoints import read_keypoints, write_keypoints
 from mover.perceive import mediapipe
 from mover.perceive.capture import Finders, perceive, read_picture_of
 from mover.perceive.config import FramesConfig, PerceiveConfig
 from mover.perceive.mediapipe import PoseInputs
 from mover.perceive.networks import Finds, link_people
-from mover.perceive.own import Video
+from mover.perceive.own import Video, own_objects, swaps
+from mover.perceive.steady import Drift
 from mover.perceive.video import Clip
 
 pytest.importorskip("cv2")
@@ -113,6 +114,53 @@ def test_another_video_in_the_same_folder_leaves_nothing_of_the_first(tmp_path: 
     assert not (tmp_path / "c" / "keypoints.npz").exists()
 
 
+def absent(_clip: Clip, _config: PerceiveConfig, _: Observer = silent) -> Finds:
+    raise InputError("no network")
+
+
+def test_what_replaced_a_file_stays_until_a_new_flag_gives_it(tmp_path: Path, capsys):
+    """What was removed is made again; of another video that is said."""
+    for name, shot in (("v", Shot()), ("w", Shot(1))):
+        filmed(tmp_path / f"{name}.mp4", shot, range(0, SECOND, 3))
+    for name in "ab":
+        shape = {"label": name, "points": [[50, 40], [80, 40], [80, 70]], "shape_type": "polygon"}
+        tree = {"imageWidth": W, "imageHeight": H, "shapes": [shape]}
+        (tmp_path / f"{name}.json").write_text(json.dumps(tree))
+    (tmp_path / "none.npz").write_text("")  # no bodies: each run ends before they are written
+    capture = tmp_path / "out" / "capture"
+    files = [capture / n for n in ("objects.json", "people.json", "keypoints.npz", "camera.json")]
+
+    def again(video: str = "v", **flags: Any) -> tuple[list[bytes | None], str]:
+        """The files after a run, and what it says."""
+        args = VideoArgs(tmp_path / f"{video}.mp4", tmp_path / "out", **flags)
+        with pytest.raises(InputError, match=r"none\.npz: cannot be read"):
+            video_to_room(replace(args, bodies=str(tmp_path / "none.npz")), FINDERS)
+        return [f.read_bytes() for f in files], capsys.readouterr().out
+
+    again(fov=60.0)
+    made, _ = again(fov=60.0, objects=tmp_path / "a.json")
+    joints = read_keypoints(files[2])
+    write_keypoints(replace(joints, points=joints.points + 1), files[2])
+    for file in (files[0], files[1], files[3]):
+        file.write_text(file.read_text() + " ")
+    own = [file.read_bytes() for file in files]
+    stays = "is yours and stays"
+    for video, flags in (
+        ("v", {}), ("v", {"fov": 60.0}), ("w", {"fov": 60.0, "objects": tmp_path / "a.json"})
+    ):  # fmt: skip
+        found, said = again(video, **flags)
+        assert found == own
+        assert said.count(stays) == 4
+        assert said.count("though the video") == (4 if video == "w" else 0)
+    found, said = again(fov=70.0, objects=tmp_path / "b.json")
+    assert found[1:3] == own[1:3]
+    assert b'"b"' in found[0]
+    assert found[3] != own[3]
+    assert (said.count("was yours"), said.count(stays)) == (2, 2)
+    files[2].unlink()
+    assert again(fov=70.0, objects=tmp_path / "b.json")[0][2] == made[2]
+
+
 SWAY = [(0, 0), (3, 1), (5, 2), (4, 1), (2, 0), (0, 0)]
 """Where in the world the pictures of a swaying camera begin [px]."""
 
@@ -143,7 +191,8 @@ def test_joints_masks_and_outlines_in_pixels_of_a_swaying_video_are_carried_alon
         film, fov=60.0, keypoints=lambda: tmp_path / "joints.json", masks=tmp_path / "masks.json",
         objects=tmp_path / "chair.json", objects_frame=4,
     )  # fmt: skip
-    perceive(video, out, PerceiveConfig(), Run(out / "perceived"), said.append, NO_FINDERS)
+    rest = PerceiveConfig(), Run(out / "perceived"), said.append, NO_FINDERS
+    perceive(video, out, *rest)
     (reference,) = re.findall(r"sways .* onto frame (\d+)", "\n".join(said))
     at = SWAY[int(reference)]
     found = read_keypoints(out / "keypoints.npz")
@@ -161,9 +210,86 @@ def test_joints_masks_and_outlines_in_pixels_of_a_swaying_video_are_carried_alon
     assert read_picture_of(out).reference is not None
     (row,) = rows(out, "objects.json")
     assert row["bbox"] == pytest.approx([W - 34 + 5 - at[0], H - 40 + 2 - at[1], 24, 28], abs=1.5)
+    whole = {"segmentation": [[0, 0, W, 0, W, H, 0, H]]}
+    (tmp_path / "full.json").write_text(
+        json.dumps({**masks, "annotations": [{**row, **whole} for row in people]})
+    )
+    with pytest.raises(InputError, match=r"full\.json: masks cover 100% .* invert them"):
+        perceive(replace(video, masks=tmp_path / "full.json"), out, *rest)
+    for zoom, shift, words in (
+        (0.5, 0, rf"masks\.json, .* of about 6\d x (4[6-9]|50) pixels: .* of {W} x {H}"),
+        (1, 60, r"masks\.json, .* both of this video, and their frames counted from 0"),
+    ):
+        points = [np.reshape(row["keypoints"], (-1, 3)) * (zoom, zoom, 1) for row in joints]
+        points = [np.add(xy, (shift, 0, 0)).tolist() for xy in points]
+        other = [{**row, "keypoints": p} for row, p in zip(joints, points, strict=True)]
+        (tmp_path / "joints.json").write_text(json.dumps(other))
+        with pytest.raises(InputError, match=words):
+            perceive(video, out, *rest)
     (tmp_path / "joints.json").write_text(json.dumps([{**joints[0], "image_id": 1}]))
     with pytest.raises(InputError, match=r"none of the frames .* expected 0, 2, 4, 6"):
-        perceive(video, out, PerceiveConfig(), Run(out / "perceived"), print, NO_FINDERS)
+        perceive(video, out, *rest)
+
+
+def test_files_that_count_frames_at_another_rate_are_taken_by_their_rate_or_refused(tmp_path: Path):
+    """So what a capture has may be handed in again with its video."""
+    film = filmed(tmp_path / "v.mp4", Shot(), range(0, 57, 3))  # ten a second
+    first, said = perceived(film, tmp_path / "c"), list[str]()
+    file, out = first / "keypoints.npz", tmp_path / "d"
+    video = Video(film, fov=60.0, keypoints=lambda: file, masks=first / "people.json")
+    perceive(video, out, PerceiveConfig(), Run(out / "perceived"), said.append, FINDERS)
+    one, other = (read_keypoints(c / "keypoints.npz") for c in (first, out))
+    assert torch.equal(one.frame, other.frame)
+    assert (one.points - other.points).abs().max() < 2  # who walks goes 2.4 px a frame
+    shown = [[row["image_id"] for row in rows(c, "people.json")] for c in (first, out)]
+    assert shown[0] == shown[1] == one.frame.tolist()
+    what = "has 'fps' 5, expected 10 as in v.mp4: frame 1 of it is taken as frame 2 of the video"
+    for name in ("keypoints.npz", "people.json"):
+        assert f"warning: {name}: {what}" in said
+    file = tmp_path / "other.npz"
+    write_keypoints(replace(one, fps=7.0), file)
+    with pytest.raises(InputError, match=r"other\.npz: has 'fps' 7, expected 10 .* number frames"):
+        perceive(video, out, PerceiveConfig(), Run(out / "perceived"), print, FINDERS)
+
+
+def test_people_whose_numbers_are_exchanged_are_said_with_the_frame():
+    """Not such as pass each other, or as stand where they cannot be told apart."""
+    frame = torch.arange(6).repeat_interleave(2)
+    x = torch.tensor([[0.0, 200.0 - 20 * k] for k in range(6)])  # one walks to the other
+    place = torch.stack([x, torch.zeros_like(x)], -1).flatten(0, 1)
+    points = place[:, None] + torch.from_numpy(100 * FIGURE).float()
+    person = torch.tensor([0, 1] * 3 + [1, 0] * 3)
+    joints = Keypoints(points, torch.ones(12, 17), "coco17", frame, person, 5.0)
+    assert swaps(joints) == [("0 and 1", 3)]
+    assert swaps(replace(joints, person=torch.tensor([0, 1] * 6))) == []
+    near = replace(joints, points=points * torch.tensor([0.05, 1.0]))
+    assert swaps(near) == []
+
+
+@pytest.mark.parametrize(("boxes", "frame", "words"), [
+    ([(0.2, 0.3, 0.4, 0.5)], None, "REFUSED o.json: .* has a box from 0 to 1, expected pixels"),
+    ([(200, 9, 20, 20)], None, "REFUSED o.json: object chair outside the picture of 128 x 96"),
+    ([(9, 9, 20, 20), (200, 9, 20, 20)], None, "warning: o.json: object chair outside .* left out"),
+    ([(9, 9, 20, 90)], None, "warning: o.json: outline chair beyond the picture, cut"),
+    ([(9, 9, 20, 20)], 9999, "REFUSED --objects-frame: has 9999, expected .* 0 to 2"),
+    ([(9, 9, 20, 20)], 3, "^$"),
+])  # fmt: skip
+def test_outlines_beyond_the_picture_or_of_a_frame_beyond_the_video_are_said(
+    tmp_path: Path, boxes: list[tuple[float, ...]], frame: int | None, words: str
+):
+    rows = [{"image_id": 0, "category_id": 1, "bbox": box} for box in boxes]
+    tree = {"images": [{"id": 0, "width": W, "height": H}], "annotations": rows}
+    names = {"categories": [{"id": 1, "name": "chair"}]}
+    (tmp_path / "o.json").write_text(json.dumps({**tree, **names}))
+    clip = Clip("", W, H, torch.arange(3) / 5, 5.0)
+    drift = Drift(torch.eye(3).repeat(3, 1, 1), torch.ones(3), 0, 0.0, "still")
+    video, said = Video(tmp_path, objects=tmp_path / "o.json", objects_frame=frame), list[str]()
+    try:
+        (row,) = own_objects(video, clip, drift, said.append)["annotations"]
+        assert row["bbox"] == pytest.approx([9, 9, 20, min(boxes[0][3], H - 9)])
+    except InputError as error:
+        said = [f"REFUSED {error}"]
+    assert re.search(words, "\n".join(said))
 
 
 def test_without_a_network_for_furniture_all_else_is_written_and_the_outlines_are_asked_for(
@@ -181,9 +307,6 @@ def test_without_a_network_for_furniture_all_else_is_written_and_the_outlines_ar
         points = torch.full((len(tracks.frame), 33, 2), 40.0)
         rows = tracks.frame, tracks.person
         return tracks, Keypoints(points, torch.ones(points.shape[:2]), "mediapipe33", *rows, None)
-
-    def absent(_clip: Clip, _config: PerceiveConfig, _: Observer = silent) -> Finds:
-        raise InputError("no network")
 
     finders = replace(NO_FINDERS, poses=poses, instances=absent)
     out = tmp_path / "out"
@@ -225,6 +348,24 @@ def test_of_a_video_that_is_cut_the_longest_shot_is_used_and_said(tmp_path, caps
     assert np.abs(clean - empty)[:, 70:90].mean() < 12
 
 
+def test_black_frames_at_the_start_are_no_shots(tmp_path, capsys):
+    pictures = [np.zeros((H, W, 3), np.uint8)] * 3 + [Shot().at(k / 5) for k in range(3, 14)]
+    perceived(write_film(tmp_path / "v.mp4", pictures, range(0, 84, 6)), tmp_path / "c")
+    said = next(line for line in capsys.readouterr().out.splitlines() if "is cut at" in line)
+    assert said.endswith(
+        "is cut at 0.6 s: the method needs one shot, and the longest is used, 0.6 to 2.6 s"
+    )
+
+
+def test_a_video_that_is_cut_off_or_of_another_kind_says_so(tmp_path: Path):
+    film = filmed(tmp_path / "v.mp4", Shot(), range(0, SECOND, 3))
+    for name, data in (("cut.mp4", film.read_bytes()[:900]), ("text.mp4", b"no video")):
+        (tmp_path / name).write_bytes(data)
+        words = rf"^{name}: cannot be read \(it is unfinished, damaged or of another kind: copy it"
+        with pytest.raises(InputError, match=words):
+            take(tmp_path / name, tmp_path / "f")
+
+
 def test_a_camera_that_moves_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     times = range(0, 3 * SECOND, 6)
     pictures = [Shot(look=(4 * k, 2 * k), chair=False).at(0) for k in range(len(times))]
@@ -232,6 +373,12 @@ def test_a_camera_that_moves_is_said(tmp_path: Path, capsys: pytest.CaptureFixtu
     told = capsys.readouterr().out
     assert "warning: the camera moves" in told
     assert "one that stands still" in told
+
+
+def test_people_who_are_found_in_few_frames_may_be_in_the_room_and_that_is_said(tmp_path, capsys):
+    pictures = [Shot(person=k < 4).at(k / 5) for k in range(10)]
+    perceived(write_film(tmp_path / "v.mp4", pictures, range(0, 60, 6)), tmp_path / "c")
+    assert "warning: people are found in 4 of 10 frames" in capsys.readouterr().out
 
 
 def test_a_video_without_furniture_ends_with_one_sentence(tmp_path: Path):

@@ -13,7 +13,8 @@ import json
 import shlex
 import subprocess
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,8 @@ class Steps:
     names: tuple[str, ...]  #: all steps in their order
     log: dict[str, dict[str, Any]] = field(default_factory=lambda: {})
     """What each took, and the hash of what it was made from."""
+    files: dict[str, str] = field(default_factory=lambda: {})
+    """Hash of each file that several steps write as they left it, and of the flags that made it."""
 
     def do(
         self,
@@ -43,11 +46,12 @@ class Steps:
         work: Callable[[], None],
         *,
         yours: bool = False,
+        of: str = "",
     ) -> None:
         """Do a step by `work` unless its last file `made` is there, made from the same.
 
         `made_from` are files, and words for settings; `yours`: a result that was replaced stays,
-        whatever it would be made from now.
+        whatever it would be made from now; `of` are the video and its lens.
         """
         key, number = digest(made_from), f"{self.names.index(name) + 1}/{len(self.names)}"
         before = self.log.get(name, {})
@@ -55,17 +59,61 @@ class Steps:
             self.say(f"{number} {name}: kept")
             return
         if yours and made.exists() and before.get("made") not in (None, digest([made])):
-            self.say(f"{number} {name}: {made.name} is yours and stays; without it, it is made")
+            self.say(f"{number} {name}: {self._staying(name, made, of)}")
             return
         self.say(f"{number} {name} ...")
         start = time.monotonic()
         work()
         seconds = round(time.monotonic() - start, 1)
-        self.log[name] = {"made_from": key, "made": digest([made]), "seconds": seconds}
+        self.log[name] = {"made_from": key, "made": digest([made]), "seconds": seconds, "of": of}
+        self._save()
+        self.say(f"{number} {name}: {seconds:.0f} s")
+
+    def changed(self, file: Path) -> bool:
+        """Whether one of `files` was replaced or removed since a step wrote it."""
+        return self.files.get(file.name, now := digest([file])) != now
+
+    @contextmanager
+    def writing(self, *files: Path) -> Generator[None]:
+        """A block that writes files of which those that were replaced go on to be the user's."""
+        own = [file for file in files if not (file.exists() and self.changed(file))]
+        for file in own:  # a killed process leaves none that looks like the user's
+            self.files.pop(file.name, None)
+        self._save()
+        try:
+            yield
+        finally:
+            self.files.update({file.name: digest([file]) for file in own})
+            self._save()
+
+    def stays(self, name: str, file: Path, flags: Sequence[object], of: str) -> bool:
+        """Whether a file was replaced and no flag that gives it is new in this command; it is said.
+
+        Of a file that does not stay it is forgotten that it was replaced.
+        """
+        key = digest_of(flags)
+        new = any(flags) and self.files.get(f"flags {file.name}") != key
+        if any(flags):
+            self.files[f"flags {file.name}"] = key
+        if not (file.exists() and self.changed(file)):
+            return False
+        if new:
+            del self.files[file.name]
+            self.say(f"{file.name} was yours: what the flags of this command give replaces it")
+        else:
+            self.say(self._staying(name, file, of))
+        return not new
+
+    def _staying(self, name: str, file: Path, of: str) -> str:
+        """The line of a file that stays as the user has it."""
+        other = self.log.get(name, {}).get("of", of) != of
+        since = ", though the video or its lens has changed" if other else ""
+        return f"{file.name} is yours and stays{since}; without it, it is made"
+
+    def _save(self) -> None:
         from mover.io.files.fields import write_json
 
-        write_json({"steps": self.log}, self.folder / "steps.json")
-        self.say(f"{number} {name}: {seconds:.0f} s")
+        write_json({"steps": self.log, "files": self.files}, self.folder / "steps.json")
 
     def undo(self, name: str, made: Path) -> None:
         """Remove what the step made, of another video; what was put in its place stays."""
@@ -76,14 +124,15 @@ class Steps:
 def steps_in(folder: Path, say: Say, names: tuple[str, ...]) -> Steps:
     """The steps of a folder, with what an earlier run has finished; a damaged log is dropped."""
     folder.mkdir(parents=True, exist_ok=True)
-    file, log = folder / "steps.json", dict[str, dict[str, Any]]()
+    file, log, files = folder / "steps.json", dict[str, dict[str, Any]](), dict[str, str]()
     if file.is_file():
         try:
-            tree = json.loads(file.read_text())["steps"]
-            log = {str(name): dict(step) for name, step in tree.items()}
+            tree = json.loads(file.read_text())
+            log = {str(name): dict(step) for name, step in tree["steps"].items()}
+            files = dict(tree.get("files", {}))
         except (ValueError, KeyError, TypeError, AttributeError):
             say(f"warning: {file.name} is damaged and is dropped: all steps are done again")
-    return Steps(folder, say, names, log)
+    return Steps(folder, say, names, log, files)
 
 
 def digest(made_from: Iterable[Path | str]) -> str:
@@ -100,6 +149,11 @@ def digest(made_from: Iterable[Path | str]) -> str:
         else:
             found.update(b"none")
     return found.hexdigest()[:16]
+
+
+def digest_of(flags: Sequence[object]) -> str:
+    """Hash of what flags give: files by content, all else as words."""
+    return digest(flag if isinstance(flag, Path) else str(flag) for flag in flags)
 
 
 def check_bodies(source: str, tool: str) -> None:

@@ -30,11 +30,12 @@ class Range(PrimitiveConstructorSpec[Any]):
     low: float
     high: float
     kind: type[int] | type[float]
+    unit: str = ""
 
     def words(self) -> str:
         """As messages say it."""
         noun = "a whole number" if self.kind is int else "a number"
-        return f"{noun} from {_short(self.low)} to {_short(self.high)}"
+        return f"{noun} from {_short(self.low)} to {_short(self.high)} {self.unit}".rstrip()
 
     def holds(self, value: object) -> bool:
         """Whether a value is such a number; NaN is none."""
@@ -44,14 +45,14 @@ class Range(PrimitiveConstructorSpec[Any]):
         return self.low <= typing.cast(float, value) <= self.high
 
 
-def _range(kind: type[int] | type[float], low: float, high: float) -> Range:
+def _range(kind: type[int] | type[float], low: float, high: float, unit: str = "") -> Range:
     return Range(
         nargs=1,
         metavar=f"{kind.__name__.upper()}:{_short(low)}..{_short(high)}",
         instance_from_str=lambda words: kind(words[0]),
         is_instance=lambda value: type(value) is kind or (kind is float and type(value) is int),
         str_from_instance=lambda value: [str(value)],
-        low=low, high=high, kind=kind,
+        low=low, high=high, kind=kind, unit=unit,
     )  # fmt: skip
 
 

@@ -46,15 +46,14 @@ from mover.io.files.fields import At, read_json, write_json
 from mover.io.files.images import find_depth_file, read_depth, reference_frame, write_image
 from mover.io.people.keypoints import write_keypoints
 from mover.perceive import mediapipe, networks
-from mover.perceive.config import ModelsConfig, PerceiveConfig
+from mover.perceive.config import PICTURES, ModelsConfig, PerceiveConfig
 from mover.perceive.layout import FirstScene, Picture
 from mover.perceive.mediapipe import PoseInputs, find_poses
 from mover.perceive.networks import Finds, JointsInputs
-from mover.perceive.own import Say, Video, own_keypoints, own_masks, own_objects, same_people
+from mover.perceive.own import FEW, Say, Video, own_keypoints, own_masks, own_objects, same_people
 from mover.perceive.reference import Clean, detections_in, hidden_mask, reference_of
 from mover.perceive.steady import Drift, find_drift, steady_frames, warnings_of
 from mover.perceive.video import (
-    PICTURES,
     Clip,
     TakeInputs,
     pictures_of,
@@ -103,15 +102,18 @@ def perceive(
             all else is written.
     """
     clip, drift, tracks, joints = moving_people(video, out, config, run, say, finders)
-    at, text = camera_by(video, (clip.width, clip.height))
+    size, keep = (clip.width, clip.height), video.keep
+    own = "camera.json" in keep
+    at, text = lens_of(size, out / "camera.json") if own else camera_by(video, size)
     if text is not None:
         say(f"warning: {text}")
     camera = camera_of(at)
     clean = reference_of(clip, drift, tracks)
     lacking: InputError | None = None
+    kept = read_json(out / "objects.json").value if "objects.json" in keep else None
     try:
-        if video.objects is not None:
-            objects = own_objects(video, clip, drift)
+        if kept is not None or video.objects is not None:
+            objects = own_objects(video, clip, drift, say) if kept is None else kept
         else:
             objects = furniture_in(clean, camera, config, run, finders, out)
     except InputError as error:  # all else is written
@@ -123,26 +125,50 @@ def perceive(
         if outlines is not None:
             tracks = mediapipe.without_furniture(tracks, joints, outlines)
             clean = reference_of(clip, drift, tracks)
-    unseen = 100 * float(clean.hidden.float().mean())
-    count = len(tracks.person.unique())
-    say(
-        f"people: {count}, {len(tracks.frame)} masks; {unseen:.1f} % of the room are never seen "
-        "without a person"
-    )
+    say(people_found(tracks, clip, clean))
     write_image(clean.picture, out / "reference.png")
-    given = {name: at.value[name] for name in LENS_FIELDS if at.value.get(name) is not None}
-    camera, by_lines = lens_by_lines(camera, given.get("focal_spread"), clean, say)
-    write_json({**camera_to_json(camera), **given, **by_lines}, out / "camera.json")
-    people = replace(tracks, frame=clip.numbers[tracks.frame]) if tracks.masks.counts else None
-    tree = people_to_json(people, hidden_mask(clean), clip.fps, clip.numbers.tolist())
-    write_json(tree, out / "people.json")
-    if joints is not None and len(joints.frame):
-        write_keypoints(replace(joints, frame=clip.numbers[joints.frame]), out / "keypoints.npz")
-    else:
-        (out / "keypoints.npz").unlink(missing_ok=True)  # of another video
+    if not own:
+        given = {name: at.value[name] for name in LENS_FIELDS if at.value.get(name) is not None}
+        camera, by_lines = lens_by_lines(camera, given.get("focal_spread"), clean, say)
+        write_json({**camera_to_json(camera), **given, **by_lines}, out / "camera.json")
+    write_people(tracks, joints, clip, clean, out, keep)
     if lacking is not None:
         raise lacking
-    write_json(objects, out / "objects.json")
+    if "objects.json" not in keep:
+        write_json(objects, out / "objects.json")
+
+
+def people_found(tracks: People, clip: Clip, clean: Clean) -> str:
+    """What is said of the people, with a warning where most frames have none."""
+    unseen, seen = 100 * float(clean.hidden.float().mean()), len(tracks.frame.unique())
+    said = (
+        f"people: {len(tracks.person.unique())}, {len(tracks.frame)} masks; {unseen:.1f} % of the "
+        "room are never seen without a person"
+    )
+    if not 0 < seen < FEW * len(clip.time):
+        return said
+    return (
+        f"{said}\nwarning: people are found in {seen} of {len(clip.time)} frames: if some were "
+        "missed in the others, reference.png may show them as part of the room; --people-masks "
+        "FILE of another tool or a closer view helps"
+    )
+
+
+def write_people(
+    tracks: People, joints: Keypoints | None, clip: Clip, clean: Clean, out: Path,
+    keep: tuple[str, ...],
+) -> None:  # fmt: skip
+    """Write people.json and keypoints.npz, by the numbers of the frames, unless they are kept."""
+    if "people.json" not in keep:
+        people = replace(tracks, frame=clip.numbers[tracks.frame]) if tracks.masks.counts else None
+        tree = people_to_json(people, hidden_mask(clean), clip.fps, clip.numbers.tolist())
+        write_json(tree, out / "people.json")
+    if "keypoints.npz" not in keep:
+        if joints is not None and len(joints.frame):
+            joints = replace(joints, frame=clip.numbers[joints.frame])
+            write_keypoints(joints, out / "keypoints.npz")
+        else:
+            (out / "keypoints.npz").unlink(missing_ok=True)  # of another video
 
 
 def outlined(objects: dict[str, Any] | None, camera: Camera) -> Bool[Tensor, "h w"] | None:
@@ -166,7 +192,7 @@ def moving_people(
         enough = video.keypoints is not None or faster <= (clip.fps or 0.0)
         if joints is None or enough or not restless(joints):
             return clip, drift, tracks, joints
-        say(f"people move fast: {faster:g} frames a second are taken")
+        say(f"people move fast: {faster:.3g} frames a second are taken")
         config = replace(config, frames=replace(config.frames, fps=faster))
 
 
@@ -218,7 +244,7 @@ def people_of_clip(
     if video.mediapipe:
         tracks, joints = run.stage(finders.poses, mediapipe.pose_inputs(clip), None)
     if video.masks is not None:
-        tracks = own_masks(video.masks, clip, drift, say)
+        tracks = own_masks(video, clip, drift, say)
     elif tracks is None:
         starts = range(0, len(clip.time), CHUNK)
         parts = [run.stage(finders.instances, clip.part(k, k + CHUNK), config) for k in starts]
@@ -227,7 +253,7 @@ def people_of_clip(
     if joints is None and config.models.keypoints and tracks.masks.counts:
         joints = run.stage(finders.joints, JointsInputs(clip, tracks), config.models)
     if joints is not None and not (video.keypoints is None and video.masks is None):
-        joints = same_people(joints, tracks)
+        joints = same_people(joints, tracks, video)
     return tracks, joints
 
 
@@ -308,9 +334,10 @@ def lens_of(
     known = None if photo is None else camera_of_photo(photo, size)
     if known is not None:
         return known, None
+    who = "" if photo is None else f" ({photo.name} has no focal length)"
     text = (
-        f"the lens is not known: {USUAL:.0f} degrees across are assumed; give --camera FILE or "
-        "--fov DEGREES (GeoCalib, MoGe and others estimate both lens and tilt)"
+        f"the lens is not known{who}: {USUAL:.0f} degrees across are assumed; give --camera FILE "
+        "or --fov DEGREES (GeoCalib, MoGe and others estimate both lens and tilt)"
     )
     return with_spread(of_view(USUAL, size, "assumed"), ASSUMED), text
 

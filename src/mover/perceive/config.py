@@ -8,6 +8,8 @@ from mover.core.settings import Seconds, Share, Weight, float_in, int_in
 from mover.energy.config import Adam, SceneWeights
 from mover.stages.config import ImageConfig, PlaceConfig, PrepareConfig
 
+PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
+
 
 @dataclass(frozen=True)
 class FramesConfig:

@@ -7,6 +7,7 @@ video that is cut the longest shot is used.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -212,13 +213,17 @@ def warnings_of(drift: Drift, time: Float[Tensor, " frames"]) -> list[str]:
     """What a user should know; `time` is that of each frame of the whole video [s]."""
     found: list[str] = []
     if drift.cuts:
-        seconds = [float(time[k]) for k in drift.cuts]
+        shots = [s for s in pairwise((0, *drift.cuts, len(time))) if s[1] - s[0] >= STAYS]
+        ends = {k for shot in shots for k in shot}  # of black frames there are none
+        seconds = [float(time[k]) for k in drift.cuts if k in ends or not shots]
         shown = ", ".join(f"{second:.1f} s" for second in seconds[:5])
+        others = [f"--frames.end {time[end]:.1f}" for _, end in shots[:1] if end <= drift.first]
+        others += [f"--frames.start {time[k]:.1f}" for k, _ in shots[-1:] if k > drift.first]
+        choice = f"; another is chosen with {' or '.join(others)}" if others else ""
         first, last = (float(time[drift.first + k]) for k in (0, len(drift.agree) - 1))
         found.append(
             f"the video is cut at {shown}: the method needs one shot, and the longest is used, "
-            f"{first:.1f} to {last:.1f} s; another is chosen with --frames.end {seconds[0]:.1f} or "
-            f"--frames.start {seconds[-1]:.1f}"
+            f"{first:.1f} to {last:.1f} s{choice}"
         )
     far = f"{drift.total:.0f} px from the first frame"
     if drift.verdict == "sways":

@@ -16,15 +16,14 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from mover.core.errors import InputError
-from mover.core.files import replacing, unreadable
+from mover.core.files import instead, replacing
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import fingerprint, record
 from mover.io.files.images import opened
 from mover.io.people.values import natural
-from mover.perceive.config import FramesConfig
+from mover.perceive.config import PICTURES, FramesConfig
 from mover.perceive.needs import install
 
-PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 LARGEST_AREA = 1 << 26  # [px²], of a frame
 QUALITY = 95  # of JPEG
 USUAL_RATE = 30.0  # frames a second, where the video gives none
@@ -154,7 +153,7 @@ def read_frames(source: Path) -> Iterator[Timed]:
                 time = float(frame.pts * frame.time_base) - first if stamped else index / rate
                 yield index, time, partial(_upright, frame)
     except (OSError, ValueError) as error:  # av's errors are of both kinds
-        raise unreadable(source, error, "a video") from error
+        raise _unreadable(source, error) from error
 
 
 def chosen(
@@ -244,10 +243,20 @@ def _opened(source: Path) -> Any:  # noqa: ANN401
     try:
         container = av.open(str(source))
     except (OSError, ValueError) as error:
-        raise unreadable(source, error, "a video") from error
+        raise _unreadable(source, error) from error
     if not container.streams.video:
         raise InputError(f"{source.name}: has no pictures, only sound, expected a video")
     return container
+
+
+def _unreadable(source: Path, error: Exception) -> InputError:
+    """The error of a video that cannot be opened or decoded; av names what its bytes are."""
+    why = instead(source)
+    if type(error) is ValueError:
+        why = str(error)
+    elif not why or "a video" in why:
+        why = "it is unfinished, damaged or of another kind: copy it again"
+    return InputError(f"{source.name}: cannot be read ({why}), expected a video")
 
 
 def _upright(frame: Any) -> Picture:  # noqa: ANN401

@@ -42,7 +42,8 @@ def lens_and_scale(camera: Camera, lens: float | None, size: float | None) -> tu
         scale = f"scale: all lengths ± {100 * size:.1f} %"
     if size > LOOSE:
         scale += (
-            "; a person's height (mover fit --height, 'heights' in people.json) would narrow it"
+            "; a person's height (mover fit --height or mover video --height, 'heights' in"
+            " people.json) would narrow it"
         )
     return text, scale
 
@@ -57,7 +58,7 @@ def tilt_of_camera(camera: Camera, spread: float) -> str:
     )
     text = f"camera: pitch {pitch:.1f}°, roll {roll:.1f}°, ± {off:.1f}° before the furniture"
     if spread > TILTED:
-        text += "; a measured tilt (mover import --tilt) would narrow it"
+        text += "; a measured tilt (mover import --tilt or mover video --tilt) would narrow it"
     return text
 
 
@@ -77,7 +78,8 @@ def odd_statures(bodies: Bodies, parts: BodyParts) -> tuple[str, ...]:
             found.append(
                 f"person {person} is {tall:.2f} m tall, {abs(tall - ADULT) / ADULTS:.1f} standard"
                 " deviations from adults, and the room is as large; a known height (mover fit"
-                " --height, or 'heights' in people.json) or a measured lens would correct it"
+                " --height or mover video --height, 'heights' in people.json) or a measured lens"
+                " would correct it"
             )
     return tuple(found)
 

@@ -97,9 +97,9 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
         return 1
     except OSError as error:  # a full disk, a folder that may not be written, a file as --out
         where = f"{error.filename}: " if error.filename else ""
-        say(
-            f"mover {name}: {where}{error.strerror or error}; what was finished is kept", sys.stderr
-        )
+        is_file = isinstance(error, FileExistsError | NotADirectoryError)
+        why = "a file is where a folder is needed" if is_file else error.strerror or error
+        say(f"mover {name}: {where}{why}; what was finished is kept", sys.stderr)
         return 2
     except (MemoryError, RuntimeError) as error:  # torch raises the second
         if isinstance(error, RuntimeError) and not re.search(OUT_OF_MEMORY, str(error)):

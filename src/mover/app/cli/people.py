@@ -130,7 +130,7 @@ class FitArgs:
     """The weights: ours, or E_Body as printed, with VPoser's weights (--vposer)."""
     ground: Annotated[float, float_in(-100, 100)] | None = None
     """Height of the floor in the camera's world, where it is known: people stand on it [m]."""
-    height: tuple[Annotated[float, float_in(0.4, 2.6)], ...] = ()
+    height: tuple[Annotated[float, float_in(0.4, 2.6, "metres")], ...] = ()
     """Heights of the people, one for all or one each in the order of their numbers [m]."""
     fps: Rate | None = None
     """Frames a second, where the keypoints give none."""

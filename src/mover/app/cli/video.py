@@ -2,8 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
-from importlib.util import find_spec
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -17,7 +16,7 @@ from mover.app.cli.people import FitArgs, fit_into
 from mover.app.cli.run import THREADS, reconstruct_into
 from mover.core.errors import InputError
 from mover.core.settings import Index, float_in
-from mover.perceive.config import LayoutConfig, PerceiveConfig
+from mover.perceive.config import PICTURES, LayoutConfig, PerceiveConfig
 from mover.perceive.needs import missing
 from mover.pipeline.presets import PRESETS
 
@@ -167,7 +166,7 @@ class VideoArgs:
     bodies_tool: str = ""
     """What wrote FILE, or what COMMAND writes: a TOOL of `mover import-bodies`; empty: bodies.npz
     itself."""
-    height: tuple[Annotated[float, float_in(0.4, 2.6)], ...] = ()
+    height: tuple[Annotated[float, float_in(0.4, 2.6, "metres")], ...] = ()
     """How tall people are, one for all or for each in the order of their numbers [m]: gives
     `--bodies fit` and the room how far they are."""
     camera: Path | None = None
@@ -212,26 +211,19 @@ def video_to_room(
         raise InputError(f"{source}: is no video, expected one, or a folder of its pictures")
     flags.preset_named(args.preset, PRESETS)
     chain.check_bodies(args.bodies, args.bodies_tool)
-    from mover.perceive.video import pictures_of, read_frames, read_picture, stamp_of
+    _check_source(source)
+    if finders is None:
+        _check_needs(args, config)  # in the first second: nothing heavy is loaded yet
+    from mover.perceive.video import pictures_of, read_picture
 
     pictures = pictures_of(source)
-    if pictures:
-        read_picture(pictures[0])
-    elif find_spec("av") is not None:
-        next(read_frames(source), None)  # what is no video is refused before what is missing
-    if finders is None:
-        _check_needs(args, config)
     if len(pictures) == 1:
+        read_picture(pictures[0])
         say(ONE_IMAGE)
     capture, steps = args.out / "capture", chain.steps_in(args.out, say, STEPS)
-    joints = None if chain.OUT in args.keypoints else Path(args.keypoints)
-    files = (args.people_masks, args.objects, joints)
-    given = (args.camera, args.fov, args.tilt, args.camera_height)
-    words = (repr(config), *given, args.keypoints, args.objects_frame)
-    stamp = str((str(source.resolve()), *stamp_of(source)))
-    made_from = [stamp, *map(str, words), *("none" if file is None else file for file in files)]
-    made = capture / "objects.json"
-    steps.do(STEPS[0], made_from, made, lambda: _pictures(args, config, capture, finders))
+    made = _taken(args, config, capture, steps, finders)
+    if not pictures and len([*(capture / "frames").iterdir()]) == 1:
+        say(ONE_IMAGE)
     if not json.loads(made.read_text())["annotations"]:
         raise InputError(
             f"{capture / 'reference.png'}: the network finds no furniture in it, so there is "
@@ -244,10 +236,45 @@ def video_to_room(
     _room(capture, args)
 
 
+def _taken(
+    args: VideoArgs, config: PerceiveConfig, capture: Path, steps: chain.Steps,
+    finders: "Finders | None",
+) -> Path:  # fmt: skip
+    """All of the capture but bodies and the first scene, and what stays of it; its last file."""
+    own = args.keypoints not in (NETWORK, MEDIAPIPE) and chain.OUT not in args.keypoints
+    joints = Path(args.keypoints) if own else args.keypoints.replace(NETWORK, "")
+    flags: dict[Path, tuple[object, ...]] = {
+        capture / "objects.json": (args.objects, args.objects_frame),
+        capture / "people.json": (args.people_masks,),
+        capture / "keypoints.npz": (joints,),
+        capture / "camera.json": (args.camera, args.fov, args.tilt, args.camera_height),
+    }
+    stamp, made = _stamp(args.source), capture / "objects.json"
+    made_from = [stamp, repr(config), *(chain.digest_of(given) for given in flags.values())]
+
+    def work() -> None:
+        keep = [f.name for f in flags if steps.stays(STEPS[0], f, flags[f], stamp)]
+        with steps.writing(*flags):
+            _pictures(args, config, capture, finders, keep)
+
+    removed = [file for file in flags if steps.changed(file) and not file.exists()]
+    steps.do(STEPS[0], made_from, (removed or [made])[0], work, of=stamp)
+    return made
+
+
+def _stamp(source: Path, capture: Path | None = None) -> str:
+    """Which video it is; with a capture, under which lens."""
+    from mover.perceive.video import stamp_of
+
+    lens = () if capture is None else (lens_in(capture),)
+    return str((str(source.resolve()), *stamp_of(source), *lens))
+
+
 def _pictures(
-    args: VideoArgs, config: PerceiveConfig, capture: Path, finders: "Finders | None"
-) -> None:
-    """All of the capture but bodies and the first scene."""
+    args: VideoArgs, config: PerceiveConfig, capture: Path, finders: "Finders | None",
+    keep: Sequence[str],
+) -> None:  # fmt: skip
+    """All of the capture but bodies, the first scene and what the user replaced."""
     import torch
 
     from mover.app.cli.progress import Bar
@@ -255,10 +282,30 @@ def _pictures(
     from mover.perceive.capture import Finders, perceive
 
     torch.set_num_threads(THREADS)
+    video = replace(_video(args, capture), keep=tuple(keep))
     with Bar() as bar:
         run = Run(capture / "perceived", bar)
-        perceive(_video(args, capture), capture, config, run, say, finders or Finders())
-    say(f"{capture}: wrote frames/, reference.png, objects.json, people.json, camera.json")
+        perceive(video, capture, config, run, say, finders or Finders())
+    names = ("frames/", "reference.png", "objects.json", "people.json", "camera.json")
+    say(f"{capture}: wrote {', '.join(name for name in names if name not in keep)}")
+
+
+def _check_source(source: Path) -> None:
+    """Refuse what is no video at a glance, before what is missing for one.
+
+    Raises:
+        InputError: If it is an empty file or a text, or a folder without pictures.
+    """
+    if source.is_dir():
+        if not any(path.suffix.lower() in PICTURES for path in source.iterdir()):
+            raise InputError(f"{source}: has no pictures, expected {', '.join(PICTURES[:3])} ...")
+    elif source.is_file():
+        with source.open("rb") as file:
+            head = file.read(64)
+        if head.isascii() and b"\0" not in head:  # nothing at all is ASCII, too
+            what = "is a text" if head else "is empty"
+            kind = "a picture" if source.suffix.lower() in PICTURES else "a video, or its pictures"
+            raise InputError(f"{source}: {what}, expected {kind}")
 
 
 def _check_needs(args: VideoArgs, config: PerceiveConfig) -> None:
@@ -310,7 +357,8 @@ def _bodies(capture: Path, args: VideoArgs, steps: chain.Steps) -> None:
         say("warning: no keypoints were found, so there are no bodies")
         steps.undo(STEPS[1], made)
         return
-    chain.write_heights(capture, args.height)
+    with steps.writing(capture / "people.json"):
+        chain.write_heights(capture, args.height)
     given = [] if args.bodies == chain.FIT or chain.OUT in args.bodies else [Path(args.bodies)]
     made_from = [keypoints, lens_in(capture), args.bodies, args.bodies_tool, *given]
     made_from += map(str, args.height)
@@ -322,7 +370,8 @@ def _bodies(capture: Path, args: VideoArgs, steps: chain.Steps) -> None:
         else:
             chain.import_bodies(args.bodies, args.bodies_tool, args.source, capture)
 
-    steps.do(STEPS[1], made_from, made, work, yours=args.bodies == chain.FIT)
+    of = _stamp(args.source, capture)
+    steps.do(STEPS[1], made_from, made, work, yours=args.bodies == chain.FIT, of=of)
 
 
 def _first_scene(capture: Path, args: VideoArgs, steps: chain.Steps) -> None:
@@ -335,8 +384,13 @@ def _first_scene(capture: Path, args: VideoArgs, steps: chain.Steps) -> None:
     made_from += [str(args.meshes), str((args.tilt, args.camera_height))]
     made_from += [] if own is None else [own[0]]
     asked = LayoutArgs(capture, args.depth, args.meshes)
-    made = capture / "scene.json"
-    steps.do(STEPS[2], made_from, made, lambda: layout_into(asked, LayoutConfig()), yours=True)
+
+    def work() -> None:
+        with steps.writing(capture / "camera.json"):
+            layout_into(asked, LayoutConfig())
+
+    of = _stamp(args.source, capture)
+    steps.do(STEPS[2], made_from, capture / "scene.json", work, yours=True, of=of)
 
 
 def lens_in(capture: Path) -> str:

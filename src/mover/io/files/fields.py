@@ -168,6 +168,8 @@ def existing(path: Path, expected: str = "") -> Path:
     """The path of a file that is there and not too large."""
     name, more = path.name or path.resolve().name, f", expected {expected}" if expected else ""
     if not path.is_file():
+        inner = path.parent / "room" / name  # of OUT of `mover video`
+        more = f", but in {inner.parent}" if inner.is_file() else more
         raise InputError(f"{name}: there is no such file in {path.parent}{more}")
     if (size := path.stat().st_size) > LARGEST_FILE:
         raise InputError(f"{name}: has {size} bytes, expected at most {LARGEST_FILE}")

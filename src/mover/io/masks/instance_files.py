@@ -10,7 +10,7 @@ from msgspec import Struct, field
 
 from mover.core.errors import InputError
 from mover.io.capture.parts import UNKNOWN, Hints, Parts
-from mover.io.files.fields import LAST_INDEX, At, read_json
+from mover.io.files.fields import FASTEST, LAST_INDEX, SLOWEST, At, read_json
 from mover.io.files.images import image_size
 from mover.io.files.schema import Id, Index, Share, Side, Text, checked
 from mover.io.masks.coco import COCO_CLASSES, COCO_IDS, MOST_THINGS, CategoryFields, is_drawn
@@ -26,6 +26,7 @@ EXPORTS = {
     "an XML of Pascal VOC": "COCO, which has masks",
     "YOLO's text": "COCO: it has no names and no size of the image",
     "a project of VIA": "COCO (Annotation, Export)",
+    "a table": "COCO (of VIA: Annotation, Export)",
     "an archive": "the files in it: unpack it",
     "COCO's panoptic JSON": "COCO of instances, or its PNG as labels",
     "Roboflow's predictions": "COCO segmentation",
@@ -33,7 +34,7 @@ EXPORTS = {
 """What is not read, and what to export in its place."""
 FOREIGN = {
     ".xml": "an XML of Pascal VOC", ".txt": "YOLO's text", ".zip": "an archive",
-    ".csv": "a project of VIA",
+    ".csv": "a table",
 }  # fmt: skip
 """What files of other kinds are."""
 
@@ -275,7 +276,10 @@ def coco_instances(
     if len(set(sizes.values())) > 1:
         at.get("images").refuse("images of one size", f"{len(set(sizes.values()))} sizes")
     looked, own = frozenset(frames.values()), next(iter(sizes.values()), size)
-    return Instances(tuple(found), own, at.file, looked, (*notes, *more))
+    info = at.maybe("info")
+    rate = info.maybe("fps") if info is not None and isinstance(info.value, dict) else None
+    fps = None if rate is None else rate.number(SLOWEST, FASTEST)
+    return Instances(tuple(found), own, at.file, looked, (*notes, *more), fps)
 
 
 def _ours(
@@ -366,6 +370,8 @@ def _instance(
         score = At(last, at.file, f"{at.field}.bbox").number(0, 1) if score is None else score
     elif row.bbox is not None:
         box = _corners(at.get("bbox"), sized=row.name is None)
+        if 0 < max(box) <= 1 and row.mask is None and not is_drawn(row.segmentation):
+            at.get("bbox").refuse("pixels", "a box from 0 to 1")
     key = -1 if row.category_id is None else row.category_id
     return Instance(
         category=words.get(key, UNKNOWN) if row.name is None else str(row.name),

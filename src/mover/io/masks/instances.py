@@ -61,6 +61,8 @@ class Instances:
     """Those that were looked at, with things in them or without."""
     notes: tuple[str, ...] = ()
     """What was decided that the source does not say."""
+    fps: float | None = None
+    """Frames a second, where the source has a rate."""
 
     def fitted(self, size: Size | None) -> "Instances":
         """The instances in an image of this size, resampled where theirs has the same shape."""
@@ -69,7 +71,8 @@ class Instances:
         (w, h), (width, height) = self.size, size
         if abs(w * height / (h * width) - 1) > SAME_SHAPE:
             at = f"{self.file}: masks of {w} x {h} pixels"
-            raise InputError(f"{at}, expected those of an image of {width} x {height}")
+            cure = "make them of it (`mover video --objects`: of OUT/capture/reference.png)"
+            raise InputError(f"{at}, expected those of an image of {width} x {height}: {cure}")
         rows = ((np.arange(height) + 0.5) * h / height).astype(np.int64).clip(0, h - 1)
         columns = ((np.arange(width) + 0.5) * w / width).astype(np.int64).clip(0, w - 1)
         items: list[Instance] = []

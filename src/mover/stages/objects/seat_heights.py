@@ -100,7 +100,7 @@ def seat_warnings(objects: tuple[SceneObject, ...]) -> tuple[str, ...]:
     return tuple(
         f"{piece.id}: its mesh does not fit the image and its seat is moved to where people sit, by"
         f" up to {50 * float(abs(piece.stretch.rise * piece.scale[1])):.0f} cm"
-        " (`--no-seat-heights` leaves it)"
+        " (`mover run --no-seat-heights` leaves it)"
         for piece in objects
         if piece.stretch is not None
     )
