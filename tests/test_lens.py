@@ -242,18 +242,36 @@ def test_a_floor_under_feet_is_as_steep_as_the_lens_makes_it(zoom: float):
     assert float(_lean(fixed, pose)[0].norm()) > 0.01
 
 
-def test_the_whole_camera_is_found_in_exact_lines():
-    camera, rng = camera_of(FOCAL), np.random.default_rng(0)
+def exact(camera: Camera, seed: int = 0) -> tuple[Segments, torch.Tensor]:
+    """Sixty lines along the axes of a room that stands askew, and its axes in those of a camera."""
     R = camera.R_cam_world.double() @ rot_y(torch.tensor(0.35).double())
+    rng = np.random.default_rng(seed)
     start = torch.from_numpy(rng.uniform([-2, -1, -6], [2, 1, -3], (60, 3)))
     axis = torch.eye(3).double()[torch.arange(60) % 3] * 0.5
     ends = torch.stack([project((start + k * axis) @ R.mT, camera.K.double()) for k in (0, 1)], 1)
     gap = ends[:, 1] - ends[:, 0]
     length = gap.norm(dim=-1)
-    segments = Segments(
+    return Segments(
         ends.mean(1) - torch.tensor([W / 2, H / 2]), gap / length[:, None], 1 / length,
         torch.ones(60).double(), torch.zeros(60).long(),
-    )  # fmt: skip
+    ), R  # fmt: skip
+
+
+def test_lines_of_two_cameras_state_an_error_as_wide_as_they_differ():
+    """Each camera fits its lines sharply, and halves of all of them now this one, now that one."""
+    apart, (one, _) = 0.2, exact(camera_of(FOCAL))
+    other, _ = exact(camera_of(FOCAL * math.exp(apart)), seed=1)
+    both = Segments(*(torch.cat([getattr(x, f.name) for x in (one, other)])
+                      for f in dataclasses.fields(Segments)))  # fmt: skip
+    one, both = (dataclasses.replace(x, error=0.3 * x.error) for x in (one, both))
+    alone = lens_of(one, 1.02 * FOCAL, 0.15)
+    assert abs(math.log(alone.zoom * 1.02)) < alone.spread < 0.02
+    assert apart / 5 < lens_of(both, math.exp(apart / 2) * FOCAL, 0.15).spread
+
+
+def test_the_whole_camera_is_found_in_exact_lines():
+    camera = camera_of(FOCAL)
+    segments, R = exact(camera)
     up = camera_of(FOCAL, -0.15, 0.0).R_cam_world[:, 1].double()
     prior = Prior(math.log(1.08 * FOCAL), 0.2, up, 0.1)
     found = fit_room(segments, prior, camera_of(FOCAL, -0.15, 0.0).R_cam_world)

@@ -17,12 +17,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mover.core.observe import Observer, Step, silent
-from mover.core.records import record
+from mover.core.records import record, rows_of
 from mover.core.types import Camera, Capture, Heading, SceneObject, Tilt
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import pitch_roll, tilted
 from mover.geometry.rotations import wrap
-from mover.stages.camera.room_lines import Ends, Prior, Segments, fit_room
+from mover.stages.camera.room_lines import Ends, Prior, Segments, fit_from, fit_room
 from mover.stages.config import LensConfig
 from mover.stages.people.find_depth import pelvis, shifted
 
@@ -31,6 +31,7 @@ UNSTATED = 0.01  # the same where nothing is stated of how it was found
 SYSTEMATIC = 0.012  # error of the logarithm that more lines do not make smaller: a bent picture
 SYSTEMATIC_TILT = 0.003  # [rad]
 VAGUE = math.radians(5)  # spread of a heading that says nothing
+HALVES = 8  # random halves of the lines: their estimates differ as much as that of all may be off
 SAYS_LITTLE = 0.95  # of the spread before any line: lines that leave more of it are no evidence
 
 
@@ -78,11 +79,28 @@ def find_lens(inputs: LensInputs, _config: LensConfig, observe: Observer = silen
     if observed is None or not stated:
         return LensEstimate(1.0, spread, tilt, heading)
     off, error = observed
+    between = _between_halves(inputs.segments, prior, ends)
+    if between >= SAYS_LITTLE * spread:
+        return LensEstimate(1.0, spread, tilt, heading)
     wide = math.hypot(error, spread)
-    left = error * spread / wide
+    left = max(error * spread / wide, between)
     zoom = math.exp(off * (spread / wide) ** 2)
     warnings = (_sentence(zoom, left),) if abs(math.log(zoom)) > left else ()
     return LensEstimate(zoom, left, tilt, heading, warnings)
+
+
+def _between_halves(segments: Segments, prior: Prior, ends: Ends) -> float:
+    """Standard deviation of the focal length's logarithm between random halves of the lines.
+
+    Half-sampling (Politis and Romano, Ann. Statist. 1994): what fits one sharply may be another
+    camera than what fits the other half.
+    """
+    chance, found = torch.Generator().manual_seed(0), list[float]()
+    for _ in range(HALVES):
+        half = torch.rand(len(segments.vote), generator=chance) < 0.5
+        other = fit_from(rows_of(segments, half, "lines"), prior, ends.pose)
+        found.append(float(_over(other, other.pose.log_focal[:, None], [0])[0]))
+    return max(float(torch.tensor(found).std()), MEASURED)
 
 
 def tilt_of(ends: Ends, before: float) -> Tilt | None:

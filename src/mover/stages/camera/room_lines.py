@@ -174,10 +174,14 @@ def fit_room(segments: Segments, prior: Prior, R_cam_world: Float[Tensor, "3 3"]
     heading = torch.arange(HEADINGS, dtype=torch.float64) * (torch.pi / 2 / HEADINGS)
     R = R_cam_world.double().cpu() @ rot_y(heading)
     focal = torch.full((HEADINGS,), prior.log_focal, dtype=torch.float64)
-    segments = counted_once(segments)
     groups = int(segments.group.max()) + 1 if len(segments.group) else 1
     none = torch.zeros(HEADINGS, groups, dtype=torch.float64)
-    pose = _turned(segments, RoomPose(focal, R, none))
+    return fit_from(segments, prior, _turned(counted_once(segments), RoomPose(focal, R, none)))
+
+
+def fit_from(segments: Segments, prior: Prior, pose: RoomPose) -> Ends:
+    """The same from other starts."""
+    segments = counted_once(segments)
     for coarse in COARSE:
         pose = _descend(segments, prior, pose, coarse)
     cost, _, precision = _quadratic(segments, prior, pose, COARSE[-1])
