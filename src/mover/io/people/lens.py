@@ -46,7 +46,7 @@ def assumed_lens(
 
 def own_lens(given: At | None, known: Known) -> tuple[At | None, tuple[str, ...]]:
     """The lens of the files, else that of the user's focal length, else what to say of it."""
-    if given is not None or known.focal is not None:
+    if given is not None or known.focal is not None or known.camera is None:
         return given or assumed_lens(known, lambda *_: 1.0), ()
     return None, ("has no lens, so the true one is taken for the tool's: --focal gives that [px]",)
 
