@@ -15,6 +15,7 @@ from mover.app.cli import say
 from mover.app.cli.people import FitArgs, fit_into
 from mover.app.cli.run import THREADS, reconstruct_into
 from mover.core.errors import InputError
+from mover.core.files import unreadable
 from mover.core.settings import Index, float_in
 from mover.perceive.config import PICTURES, LayoutConfig, PerceiveConfig
 from mover.perceive.needs import missing
@@ -303,9 +304,8 @@ def _check_source(source: Path) -> None:
         with source.open("rb") as file:
             head = file.read(64)
         if head.isascii() and b"\0" not in head:  # nothing at all is ASCII, too
-            what = "is a text" if head else "is empty"
             kind = "a picture" if source.suffix.lower() in PICTURES else "a video, or its pictures"
-            raise InputError(f"{source}: {what}, expected {kind}")
+            raise unreadable(source, "it is a text", kind)
 
 
 def _check_needs(args: VideoArgs, config: PerceiveConfig) -> None:

@@ -31,7 +31,7 @@ UP: dict[str, Matrix] = {
 """The user's world -> +y up, right-handed."""
 OURS = ("ground", "camera", "light")  # what a scene.glb of this program has beside its furniture
 SHELL = frozenset({"floor", "wall", "ceiling", "ground", "roof", "window", "door"})
-WIDEST = 2.5  # [m], no furniture is wider and deeper
+WIDEST = 3.0  # [m], no furniture is wider and deeper
 NO_ROOM = 1e-5  # [share], a transform that is nothing but rounding
 
 
