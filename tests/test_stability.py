@@ -289,3 +289,6 @@ def test_evaluate_prints_the_share_that_stays_before_and_after(tmp_path: Path, c
     assert "stable is not measured: mujoco is not installed; pip" in capsys.readouterr().out
     metrics = json.loads((out / "metrics.json").read_text())
     assert "stable" not in metrics["result"]
+    write_out(tmp_path / "same", Scene(camera(), GROUND, tuple(boxes)))
+    assert run_command("evaluate", [str(out), "--truth", str(tmp_path / "same")]) == 0
+    assert "same has the initial scene of this result" in capsys.readouterr().out

@@ -32,6 +32,9 @@ class CheckArgs:
     """How the capture is written."""
 
 
+SAME = 0.999  # IoU3D of one scene and itself
+
+
 @dataclass(frozen=True)
 class EvaluateArgs:
     """Compare a result with the truth; writes OUT/metrics.json."""
@@ -91,7 +94,10 @@ def evaluate(arguments: Sequence[str]) -> None:
     _check_result(args.out)
     from mover.evaluate.evaluation import evaluate_folder, table
 
-    say(table(evaluate_folder(args.out, args.truth, physics=args.stable)))
+    found = evaluate_folder(args.out, args.truth, physics=args.stable)
+    say(table(found))
+    if found["initial"].get("iou3d", 0) > SAME:
+        say(f"warning: --truth: {args.truth} has the initial scene of this result, not another one")
 
 
 if TYPE_CHECKING:
