@@ -123,7 +123,7 @@ def test_contacts_of_another_tool_become_contacts_npz(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_a_run_ends_with_the_people_that_refine_would_give(tmp_path, small_capture):
+def test_a_run_ends_with_the_people_that_refine_would_give(tmp_path, small_capture, capsys):
     """The room is the same, and its people are those of `mover refine` on the plain result."""
     from mover.io.capture.folder import write_capture
 
@@ -134,7 +134,11 @@ def test_a_run_ends_with_the_people_that_refine_would_give(tmp_path, small_captu
     assert cli.run_command("run", run) == 0
     scene, given = (out / "scene.json").read_bytes(), read_bodies(out / "bodies.npz")
     assert cli.run_command("refine", [str(out)]) == 0
-    assert cli.run_command("run", [*run, "--refine"]) == 0
+    (tmp_path / "capture").rename(tmp_path / "same")  # what a folder had before is not lost unsaid
+    again = [str(tmp_path / "same"), *run[1:], "--refine"]
+    assert "which is replaced" not in capsys.readouterr().out
+    assert cli.run_command("run", again) == 0
+    assert f"has the result of {run[0]}, which is replaced" in capsys.readouterr().out
     found, wanted = (read_bodies(out / name) for name in ("bodies.npz", "refined/bodies.npz"))
     torch.testing.assert_close(found.verts, wanted.verts, atol=2e-3, rtol=0)
     assert (found.verts - given.verts).norm(dim=-1).median() > 0.01

@@ -4,6 +4,7 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -13,6 +14,7 @@ from tyro.conf import Positional, arg
 from mover.app.batch import CONFIG, SUMMARY, BatchJob, RayOptions
 from mover.app.cli import config as flags
 from mover.app.cli import say
+from mover.core.errors import InputError
 from mover.core.settings import Seconds, int_in
 from mover.io.formats import chosen
 from mover.pipeline.presets import PRESETS, Config
@@ -60,10 +62,15 @@ def run(arguments: Sequence[str]) -> None:
     from mover.app.results import Origin
     from mover.core.devices import device_of
     from mover.io.capture.edits import read_edits
+    from mover.io.files.fields import read_json
 
     device, capture = device_of(args.device), read(args.source)
     edits = () if args.edits is None else read_edits(args.edits)
     origin = Origin(str(args.source.resolve()), args.format, edits, args.refine, device)
+    with suppress(InputError):  # of a log that is missing or damaged
+        old = read_json(args.out / "run.json").get("source").value
+        if old not in ("", origin.source):
+            say(f"note: {args.out} has the result of {old}, which is replaced")
     reconstruct_into(args.out, capture, config, origin)
     say(f"report: {args.out / 'report.html'}")
 
