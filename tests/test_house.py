@@ -15,7 +15,7 @@ import pytest
 
 HOME = Path(__file__).parents[1]
 LINES = {
-    "src/mover/app": 4_373,
+    "src/mover/app": 4_386,
     "src/mover/bodies": 1_962,
     "src/mover/core": 1_521,
     "src/mover/energy": 3_781,
@@ -30,14 +30,14 @@ LINES = {
     "src/mover/stages": 6_146,
     "bench": 7_468,
     "benchmarks": 1_183,
-    "tests": 30_108,
+    "tests": 30_115,
 }
 FILES = {"src/mover": 239, "bench": 40}
 LIMITS = {
     "words in code": 0,
     "words in pages": 0,
     "class names with two meanings": 0,
-    "small helpers": 54,
+    "small helpers": 53,
     "modules in circles": 0,
 }  # fmt: skip
 WORDS = {
