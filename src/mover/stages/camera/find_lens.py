@@ -22,7 +22,7 @@ from mover.core.types import Camera, Capture, Heading, SceneObject, Tilt
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import pitch_roll, tilted
 from mover.geometry.rotations import wrap
-from mover.stages.camera.room_lines import Ends, Prior, Segments, fit_from, fit_room
+from mover.stages.camera.room_lines import Ends, Prior, Segments, counted_once, fit_from, fit_room
 from mover.stages.config import LensConfig
 from mover.stages.people.find_depth import pelvis, shifted
 
@@ -97,8 +97,8 @@ def _between_halves(segments: Segments, prior: Prior, ends: Ends) -> float:
     """
     chance, found = torch.Generator().manual_seed(0), list[float]()
     for _ in range(HALVES):
-        half = torch.rand(len(segments.vote), generator=chance) < 0.5
-        other = fit_from(rows_of(segments, half, "lines"), prior, ends.pose)
+        half = rows_of(segments, torch.rand(len(segments.vote), generator=chance) < 0.5, "lines")
+        other = fit_from(counted_once(half), prior, ends.pose)
         found.append(float(_over(other, other.pose.log_focal[:, None], [0])[0]))
     return max(float(torch.tensor(found).std()), MEASURED)
 

@@ -176,12 +176,12 @@ def fit_room(segments: Segments, prior: Prior, R_cam_world: Float[Tensor, "3 3"]
     focal = torch.full((HEADINGS,), prior.log_focal, dtype=torch.float64)
     groups = int(segments.group.max()) + 1 if len(segments.group) else 1
     none = torch.zeros(HEADINGS, groups, dtype=torch.float64)
-    return fit_from(segments, prior, _turned(counted_once(segments), RoomPose(focal, R, none)))
+    segments = counted_once(segments)
+    return fit_from(segments, prior, _turned(segments, RoomPose(focal, R, none)))
 
 
 def fit_from(segments: Segments, prior: Prior, pose: RoomPose) -> Ends:
-    """The same from other starts."""
-    segments = counted_once(segments)
+    """The same from other starts, with votes as `counted_once` gives them."""
     for coarse in COARSE:
         pose = _descend(segments, prior, pose, coarse)
     cost, _, precision = _quadratic(segments, prior, pose, COARSE[-1])
