@@ -273,7 +273,7 @@ CONFIG = replace(
     ROBUST.place, method=BatchedBFGS(),
     weights=replace(ROBUST.place.weights, given=0.0, measured=0.0),  # in tests of their own
 )  # fmt: skip
-UNLINED = replace(CONFIG, wall_alignment_steps=0)
+UNLINED = replace(CONFIG, walls=False)
 
 
 class TestPlacing:

@@ -68,7 +68,7 @@ def _subsets(preset: str, prefix: str) -> dict[str, Variant]:
     return {n: with_terms(PRESETS[preset], *s) for n, s in zip(names, subsets, strict=True)}
 
 
-NO_WALLS = {s: replace(getattr(ROBUST, s), wall_alignment_steps=0) for s in ("layout", "place")}
+NO_WALLS = {s: replace(getattr(ROBUST, s), walls=False) for s in ("layout", "place")}
 NOT_GIVEN = replace(ROBUST.layout, weights=replace(ROBUST.layout.weights, given=0.0))
 LISTS: dict[str, dict[str, Variant]] = {
     "ablation": {

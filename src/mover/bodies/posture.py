@@ -30,6 +30,7 @@ LONGEST_GAP = 1.0  # [s] between rows of a track that still give a speed
 Places = Float[Tensor, "bodies landmarks 3"]
 """Of `LANDMARKS` [m]."""
 Chance = Float[Tensor, "bodies verts"]
+Some = Float[Tensor, "bodies some"]  # of the vertices of a part
 """That a vertex touches something, and values like it."""
 
 
@@ -194,15 +195,24 @@ def touching(bodies: Bodies, parts: BodyParts, ground: Height) -> Chance:
     places = landmarks(bodies, parts)
     normals = vertex_normals(bodies.verts, bodies.faces)
     down = _ramp(-normals[..., 1], *FACING)
-    seat = members(parts, "seat", "left_thigh", "right_thigh")  # what faces down and is low enough
-    chances = [
-        _flat(-bodies.verts[..., 1], down * seat * pose.sitting[:, None], LAYER),
-        _recline(bodies, parts, pose, places, normals),
-        _lie(bodies, parts, pose, down),
-        _rest_arms(bodies, parts, places, down, ground),
-        _stand(bodies, parts, ground),
-    ]
-    return torch.stack(chances).amax(0)
+    chance = torch.zeros_like(down)
+
+    def add(part: Bool[Tensor, " verts"], found: Some) -> None:
+        chance[:, part] = torch.maximum(chance[:, part], found)
+
+    seat, back = members(parts, "seat", "left_thigh", "right_thigh"), members(parts, "back")
+    low = down[:, seat] * pose.sitting[:, None]  # what faces down and is low enough
+    add(seat, _flat(-bodies.verts[:, seat, 1], low, LAYER))
+    add(back, _recline(bodies.verts[:, back], pose, places, normals[:, back]))
+    if bool((pose.lying > 0).any()):
+        add(torch.ones_like(seat), _lie(bodies, parts, pose, down))
+    for name in ("left_palm", "right_palm", "left_forearm", "right_forearm"):
+        part = members(parts, name)
+        add(part, _rest_arm(name, bodies.verts[:, part], bodies, places, down[:, part], ground))
+    for name in SOLES:
+        part = members(parts, name)
+        add(part, _stand(bodies, part, ground))
+    return chance
 
 
 def _ramp(value: Tensor, zero: float, one: float) -> Tensor:
@@ -219,8 +229,7 @@ def _flat(reach: Chance, chance: Chance, layer: tuple[float, float]) -> Chance:
 
 
 def _recline(
-    bodies: Bodies,
-    parts: BodyParts,
+    verts: Float[Tensor, "bodies verts 3"],
     pose: Postures,
     places: Places,
     normals: Float[Tensor, "bodies verts 3"],
@@ -232,8 +241,7 @@ def _recline(
     axis = trunk / trunk.norm(dim=-1, keepdim=True).clamp_min(1e-9)
     backward = torch.linalg.cross(axis, torch.linalg.cross(axis, front))
     backward = torch.nan_to_num(backward / backward.norm(dim=-1, keepdim=True).clamp_min(1e-9))
-    reach = torch.einsum("bvi,bi->bv", bodies.verts, backward)
-    return _flat(reach, behind * members(parts, "back") * lean[:, None], LAYER)
+    return _flat(torch.einsum("bvi,bi->bv", verts, backward), behind * lean[:, None], LAYER)
 
 
 def _lie(bodies: Bodies, parts: BodyParts, pose: Postures, down: Chance) -> Chance:
@@ -247,27 +255,20 @@ def _lie(bodies: Bodies, parts: BodyParts, pose: Postures, down: Chance) -> Chan
     return _flat(-height, down * region * pose.lying[:, None], (2 * LAYER[0], 2 * LAYER[1]))
 
 
-def _rest_arms(
-    bodies: Bodies, parts: BodyParts, places: Places, down: Chance, ground: Height
-) -> Chance:
-    """Hands and forearms at rest on a surface, not on the own lap: what faces down of them."""
-    chance = torch.zeros_like(down)
-    for name in ("left_palm", "right_palm", "left_forearm", "right_forearm"):
-        part = members(parts, name)
-        if not part.any():
-            continue
-        side, _, kind = name.partition("_")
-        middle = bodies.verts[:, part].mean(1)
-        rest = _ramp(speeds(middle[:, None], bodies)[:, 0], STILL[1], STILL[0])
-        height = middle[:, 1] - ground
-        free = (from_lap(middle, places) > LAP) & (height > SURFACE[0]) & (height < SURFACE[1])
-        if kind == "forearm":
-            arm = at(places, f"{side}_wrist") - at(places, f"{side}_elbow")
-            free = free & (elevation(arm).abs() < LEVEL_ARM)
-        mostly = _ramp(down[:, part].mean(1), 0.2, 0.5)
-        hand = down * part * (rest * free * mostly)[:, None]
-        chance = torch.maximum(chance, _flat(-bodies.verts[..., 1], hand, PALM))
-    return chance
+def _rest_arm(
+    name: str, verts: Tensor, bodies: Bodies, places: Places, down: Some, ground: Height
+) -> Some:
+    """A hand or forearm at rest on a surface, not on the own lap: what faces down of it."""
+    side, _, kind = name.partition("_")
+    middle = verts.mean(1)
+    rest = _ramp(speeds(middle[:, None], bodies)[:, 0], STILL[1], STILL[0])
+    height = middle[:, 1] - ground
+    free = (from_lap(middle, places) > LAP) & (height > SURFACE[0]) & (height < SURFACE[1])
+    if kind == "forearm":
+        arm = at(places, f"{side}_wrist") - at(places, f"{side}_elbow")
+        free = free & (elevation(arm).abs() < LEVEL_ARM)
+    mostly = _ramp(down.mean(1), 0.2, 0.5)
+    return _flat(-verts[..., 1], down * (rest * free * mostly)[:, None], PALM)
 
 
 def from_lap(point: Float[Tensor, "bodies 3"], places: Places) -> Float[Tensor, " bodies"]:
@@ -282,7 +283,7 @@ def from_lap(point: Float[Tensor, "bodies 3"], places: Places) -> Float[Tensor, 
     return torch.minimum(*ways)
 
 
-def _stand(bodies: Bodies, parts: BodyParts, ground: Height) -> Chance:
+def _stand(bodies: Bodies, part: Bool[Tensor, " verts"], ground: Height) -> Some:
     """Soles: hardly moving, and as low as the body reaches, which is about the ground.
 
     A body whose depth is wrong floats or sinks by some centimetres: its own lowest point shows
@@ -291,12 +292,7 @@ def _stand(bodies: Bodies, parts: BodyParts, ground: Height) -> Chance:
     height = bodies.verts[..., 1]
     lowest = height.amin(1, keepdim=True)
     floor = _ramp((lowest[:, 0] - ground).abs(), FLOATS[1], FLOATS[0])[:, None]
-    near = _ramp(height - lowest, SOLE[1], SOLE[0]) * floor
-    chance = torch.zeros_like(near)
-    for name in SOLES:
-        part = members(parts, name)
-        if part.any():
-            middle = bodies.verts[:, part].mean(1, keepdim=True)
-            rest = _ramp(speeds(middle, bodies)[:, 0], STANCE[1], STANCE[0])
-            chance = torch.maximum(chance, near * part * rest[:, None])
-    return chance
+    near = _ramp(height[:, part] - lowest, SOLE[1], SOLE[0]) * floor
+    middle = bodies.verts[:, part].mean(1, keepdim=True)
+    rest = _ramp(speeds(middle, bodies)[:, 0], STANCE[1], STANCE[0])
+    return near * rest[:, None]

@@ -109,16 +109,20 @@ def sample_surface(
     Raises:
         ValueError: If the mesh has no area.
     """
-    points, face = _scatter(mesh, OVERSAMPLING * count, np.random.default_rng(seed))
+    points, normals = scatter(mesh, OVERSAMPLING * count, seed)
     chosen = farthest_first(points, count)
-    return points[chosen], face_normals(mesh.verts.detach(), mesh.faces)[face[chosen]]
+    return points[chosen], normals[chosen]
 
 
-def _scatter(
-    mesh: Mesh, count: int, rng: np.random.Generator
-) -> tuple[Float[Tensor, "count 3"], Int[Tensor, " count"]]:
-    """Random points, as many on each face as its area asks, and their faces."""
-    verts = mesh.verts.detach()
+def scatter(
+    mesh: Mesh, count: int, seed: int = 0
+) -> tuple[Float[Tensor, "count 3"], Float[Tensor, "count 3"]]:
+    """Random points, as many on each face as its area asks [m], face by face, and their normals.
+
+    Raises:
+        ValueError: If the mesh has no area.
+    """
+    verts, rng = mesh.verts.detach(), np.random.default_rng(seed)
     area = _area_vectors(verts, mesh.faces).norm(dim=-1).double().cumsum(0)
     if len(area) == 0 or not float(area[-1]) > 0:
         raise ValueError("sample_surface: the mesh has no area")
@@ -127,7 +131,7 @@ def _scatter(
     u, v = torch.from_numpy(rng.random((2, count))).to(verts)
     u, v = torch.where(u + v > 1, 1 - u, u)[:, None], torch.where(u + v > 1, 1 - v, v)[:, None]
     a, b, c = verts[mesh.faces[face]].unbind(-2)
-    return a + u * (b - a) + v * (c - a), face
+    return a + u * (b - a) + v * (c - a), face_normals(verts, mesh.faces)[face]
 
 
 def decimate(mesh: Mesh, faces: int) -> Mesh:

@@ -149,7 +149,7 @@ ROBUST = Config(
     ),
     layout=PlaceConfig(
         _ROBUST_IMAGE, "robust", BatchedBFGS(), yaws=16, short=_SHORT,
-        num_hypotheses=6, coarse=2, wall_alignment_steps=2,
+        num_hypotheses=6, coarse=2, walls=True,
         yaw_prior_weight=1.0,
     ),
     refine=RefineConfig(rounds=8),
@@ -157,7 +157,7 @@ ROBUST = Config(
     gather=GatherConfig(erode=1, reach=0.1, cells=128),
     assign=_GROUPS,
     place=PlaceConfig(
-        _ROBUST_FULL, "robust", BatchedBFGS(), wall_alignment_steps=2,
+        _ROBUST_FULL, "robust", BatchedBFGS(), walls=True,
         yaw_prior_weight=1.0, apart=0.3,
     ),
     outer_iterations=1,

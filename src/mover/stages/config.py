@@ -156,8 +156,8 @@ class PlaceConfig:
     """Starts of each object that are left after the short descents."""
     coarse: Annotated[int, int_in(1, 64)] = 1
     """Pixels of a window that are one, along each side, in the short descents."""
-    wall_alignment_steps: Annotated[int, int_in(0, 100)] = 0
-    """How often objects along a wall are placed again with its line (robust)."""
+    walls: bool = False
+    """Objects along a wall are placed again with its line (robust)."""
     yaw_prior_weight: Weight = 0.0
     """How much a turn away from the reference yaw worsens a candidate: 1 doubles half a turn."""
     apart: Weight = 0.0

@@ -128,12 +128,13 @@ def depth_bounds(
     table, views = mask_table(inputs.people, inputs.bodies), small_views(inputs.camera)
     blank = torch.full((views.height, views.width), float("inf"))
     maps, lock = DepthMaps(-blank, blank), Lock()
+    objects = small_masks(inputs.masks, inputs.camera).cpu()
     near = poses_at(inputs.path, inputs.bodies.frame).t_reference_camera.norm(dim=-1) <= BESIDE
     pairs = enumerate(zip(table.own, near.tolist(), strict=True))
     rows = [row for row, (own, beside) in pairs if own is not None and beside]
 
     def add(block: list[int]) -> int:
-        for window, found in _bounds(inputs, config, table, block):
+        for window, found in _bounds(inputs, config, table, objects, block):
             with lock:  # the least and the greatest do not depend on the order
                 kept = merge(DepthMaps(maps.near[window], maps.far[window]), found)
                 maps.near[window], maps.far[window] = kept.near, kept.far
@@ -150,9 +151,9 @@ def depth_bounds(
 
 
 def _bounds(
-    inputs: GatherInputs, config: GatherConfig, table: MaskTable, block: list[int]
+    inputs: GatherInputs, config: GatherConfig, table: MaskTable, objects: Tensor, block: list[int]
 ) -> Iterator[tuple[Window, DepthMaps]]:
-    """Where each of some bodies is seen, and its bounds there."""
+    """Where each of some bodies is seen before or behind objects, and its bounds there."""
     camera, views = inputs.camera, small_views(inputs.camera)
     verts = to_camera(inputs.bodies.verts[torch.tensor(block)], camera.R_cam_world)
     many = replace(views, K=views.K.expand(len(block), 3, 3))
@@ -172,14 +173,16 @@ def _bounds(
             slice(max(first - edge, 0), min(last + edge, views.height)),
             slice(max(left - edge, 0), min(right + edge, views.width)),
         )
+        crossed = objects[:, *window]
+        crossed = crossed[crossed.flatten(1).any(1)]
+        if not len(crossed):
+            continue
         visible, others = _masks_in(inputs, table, row, window, front)
         reach = config.reach
         if reach > 0:
             reach *= float(views.K[0, 0, 0] / verts[k, :, 2].median().clamp_min(NEAREST))
         view = BodyView(front[window], leave[k][window], visible, others, reach)
-        objects = small_masks(inputs.masks, camera, window).cpu()
-        objects = objects[objects.flatten(1).any(1)]
-        yield window, bounds_of(view, objects, config.erode, config.vote)
+        yield window, bounds_of(view, crossed, config.erode, config.vote)
 
 
 def _masks_in(

@@ -39,7 +39,8 @@ def place_objects(inputs: PlaceInputs, config: PlaceConfig, observe: Observer = 
         return Placed(at, candidates, energy, found.trace, given.image.walls)
 
     placed = lower(inputs, starts_left(inputs, config, observe))
-    placed = line_up(placed, inputs, config.wall_alignment_steps, lower)
+    if config.walls:
+        placed = line_up(placed, inputs, lower)
     if not config.apart:
         return placed
     energy = energy_of(with_walls(inputs, placed.walls), config)

@@ -15,7 +15,8 @@ from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
 from mover.core.types import Layout, Mesh, Objects, SceneObject, SeatStretch
 from mover.furniture.library import BACKS, SEATS, canonical
-from mover.geometry.mesh import bottom_center, box, decimate, sample_surface, signed_volume, used
+from mover.geometry import mesh as shapes
+from mover.geometry.mesh import bottom_center, box, decimate, signed_volume, used
 from mover.geometry.occupancy import load_occupancy, occupied_mesh
 from mover.geometry.placement import FREE, GROUND
 from mover.geometry.rotations import rot_y
@@ -203,8 +204,8 @@ def _proxy(piece: SceneObject, config: PrepareConfig, close: Callable[[Mesh], Me
     mesh = close(Mesh((mesh.verts - center) * piece.scale, mesh.faces))
     if config.level_feet:
         mesh = levelled(mesh)
-    points = sample_surface(mesh, 4 * config.samples)
-    samples, _ = sample_surface(mesh, config.samples)
+    points = shapes.scatter(mesh, 4 * config.samples)
+    samples, _ = shapes.sample_surface(mesh, config.samples)
     regions = find_regions(*points, canonical(piece.category), config.regions)
     return _Proxy(mesh, edges_of(mesh.faces), samples, *regions, center)
 

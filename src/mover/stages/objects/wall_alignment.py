@@ -26,11 +26,16 @@ UNSEEN = 0.2  # how much an object whose base is not seen counts against one who
 TURN = math.pi / 4  # rears that are turned farther than this do not belong to a line
 STRETCH = (0.7, 1.4)  # of its distance, within which an object is moved to a line
 BOTTOM = 3  # number of the side of a box on which the object stands
+ROUNDS = 2  # the lines run where the objects were found at first, then where these lines put them
+STILL, FAR = (
+    0.03,
+    2.0,
+)  # [m] by which lines may move, at this distance along them, and stay the same
 KEPT = 3  # candidates of the search without lines from which an object descends again
 
 
 def line_up(
-    found: Placed, inputs: PlaceInputs, rounds: int, lower: Callable[[PlaceInputs, Layout], Placed]
+    found: Placed, inputs: PlaceInputs, lower: Callable[[PlaceInputs, Layout], Placed]
 ) -> Placed:
     """Place the objects along walls again, with the lines of others.
 
@@ -38,9 +43,12 @@ def line_up(
         Objects that belong to no line are as they were found.
     """
     lined = found
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         walls = find_walls(lined.layout, inputs.objects, inputs.image.sides)
-        if walls is None:
+        if walls is None or (
+            lined.walls is not None
+            and torch.allclose(walls.offset, lined.walls.offset, rtol=0.0, atol=STILL)
+        ):
             break
         starts = starts_at(lined.layout, inputs.objects, walls)
         few = best_few(found.candidates, found.energy, KEPT)
