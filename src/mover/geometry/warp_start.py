@@ -163,12 +163,6 @@ def mapped(work: Callable[[A], B], items: Sequence[A]) -> list[B]:
     return [found[k] for k in range(len(items))]
 
 
-def beside(first: Callable[[], A], second: Callable[[], B]) -> tuple[A, B]:
-    """What both give, the one computed beside the other where two threads are wanted."""
-    found = mapped(lambda work: work(), [first, second])
-    return found[0], found[1]  # pyright: ignore[reportReturnType]
-
-
 @cache
 def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(thread_name_prefix="mover-draw")

@@ -47,8 +47,10 @@ class Drawn:
     """What each pixel of an eye shows."""
 
     owner: Int[Tensor, "h w"]  #: as in `Surfaces`; `NO_OWNER` for nothing
-    normal: Float[Tensor, "h w 3"]  #: of the surface in the world, towards the eye
-    tint: Float[Tensor, "h w 3"]
+    face: Int[Tensor, "h w"]  #: the first one; any for nothing
+    normals: Float[Tensor, "faces 3"]
+    """Of the surfaces in the world, towards the eye."""
+    tint: Float[Tensor, "faces 3"]
 
 
 def furniture(scene: Scene) -> Surfaces:
@@ -120,28 +122,26 @@ def draw(surfaces: Surfaces, camera: Camera) -> Drawn:
     """What the camera sees of the surfaces, whatever their winding."""
     size = (camera.height, camera.width)
     if not len(surfaces.faces):
-        none = torch.zeros(*size, 3)
-        return Drawn(none[..., 0].long() + NO_OWNER, none, none)
+        none = torch.zeros(size, dtype=torch.long)
+        return Drawn(none + NO_OWNER, none, torch.zeros(1, 3), torch.zeros(1, 3))
     points = to_camera(surfaces.verts, camera.R_cam_world)
-    _, face = first_hit(points, surfaces.faces, camera.K, size)
-    hit, index = (face >= 0)[..., None], face.clamp_min(0)
-    middle = surfaces.verts[surfaces.faces].mean(1)
-    away = (middle * surfaces.normals).sum(-1, keepdim=True) > 0
+    face = first_hit(points, surfaces.faces, camera.K, size)[1]
+    owner = torch.where(face >= 0, surfaces.owner[face.clamp_min(0)], NO_OWNER)
+    away = (surfaces.verts[surfaces.faces].mean(1) * surfaces.normals).sum(-1, keepdim=True) > 0
     normals = torch.where(away, -surfaces.normals, surfaces.normals)
-    owner = torch.where(hit[..., 0], surfaces.owner[index], torch.full_like(index, NO_OWNER))
-    return Drawn(owner, normals[index] * hit, surfaces.tint[index] * hit)
+    return Drawn(owner, face.clamp_min(0), normals, surfaces.tint)
 
 
 def paint(drawn: Drawn) -> Float[Tensor, "height width 4"]:
     """A sheet at 1 / `FINE` of the size of what is drawn."""
-    facing = (drawn.normal @ normalize(torch.tensor(LIGHT), dim=0)).clamp_min(0)
-    shade = AMBIENT + LAMP * facing + FILL * drawn.normal[..., 2]
-    colours = (drawn.tint * shade[..., None]).clamp(0, 1)
+    facing = (drawn.normals @ normalize(torch.tensor(LIGHT), dim=0)).clamp_min(0)
+    shade = AMBIENT + LAMP * facing + FILL * drawn.normals[:, 2]
+    colours, dark = (drawn.tint * shade[:, None]).clamp(0, 1)[drawn.face], drawn.tint * 0.40
     outline, crease = _lines(drawn, max(1, round(drawn.owner.shape[1] / FINE / THICK)))
-    colours = colours.lerp(drawn.tint * 0.40, CREASE * crease[..., None].float())
-    colours = colours.lerp(drawn.tint * 0.40, LINE * outline[..., None].float())
-    alpha = torch.maximum(OPACITY * (drawn.owner != NO_OWNER).float(), LINE * outline.float())
-    fine = torch.cat([colours * alpha[..., None], alpha[..., None]], -1)
+    for line, opacity in ((crease, CREASE), (outline, LINE)):
+        colours[line] = colours[line].lerp(dark[drawn.face[line]], opacity)
+    alpha = torch.where(outline, LINE, torch.where(drawn.owner != NO_OWNER, OPACITY, 0.0))
+    fine = torch.cat([colours.mul_(alpha[..., None]), alpha[..., None]], -1)
     return avg_pool2d(fine.permute(2, 0, 1), FINE).permute(1, 2, 0)
 
 
@@ -156,12 +156,14 @@ def _lines(drawn: Drawn, thickness: int) -> tuple[Bool[Tensor, "h w"], Bool[Tens
     for axis in (0, 1):
         n = drawn.owner.shape[axis] - 1
         first, second = drawn.owner.narrow(axis, 0, n), drawn.owner.narrow(axis, 1, n)
-        bent = (drawn.normal.narrow(axis, 0, n) * drawn.normal.narrow(axis, 1, n)).sum(-1) < SHARP
         border = first != second
         outline.narrow(axis, 0, n).logical_or_(border)
         outline.narrow(axis, 1, n).logical_or_(border)
-        stiff = (first != NO_OWNER) & (first < PERSON)
-        crease.narrow(axis, 0, n).logical_or_(bent & ~border & stiff)
+        one, other = drawn.face.narrow(axis, 0, n), drawn.face.narrow(axis, 1, n)
+        inner = (one != other) & ~border & (first != NO_OWNER) & (first < PERSON)
+        at = inner.nonzero(as_tuple=True)
+        inner[at] = (drawn.normals[one[at]] * drawn.normals[other[at]]).sum(-1) < SHARP
+        crease.narrow(axis, 0, n).logical_or_(inner)
     return widened(outline[None], thickness - 1)[0] & (drawn.owner != NO_OWNER), crease
 
 

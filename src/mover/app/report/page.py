@@ -33,7 +33,6 @@ from mover.core.files import replacing
 from mover.core.records import map_tensors
 from mover.core.types import Bodies, Scene
 from mover.geometry.camera import pitch_roll
-from mover.geometry.warp_start import beside, mapped
 
 
 @dataclass(frozen=True)
@@ -83,10 +82,8 @@ def _page(content: ReportContent) -> str:
     extent = extent_of(*scenes.values(), *people.values())
     scores = [(content.metrics or {}).get(side) or {} for side in sides]
     metrics = [(key, metric_of(key)) for key in TILES if key in scores[1]]
-    (text, block), (before, after) = beside(
-        lambda: pack_view(scenes, people),
-        lambda: mapped(lambda side: _overlay(content.image, scenes[side]), sides),
-    )
+    text, block = pack_view(scenes, people)
+    before, after = (_overlay(content.image, scenes[side]) for side in sides)
     return fill(
         "page.html",
         content=content,

@@ -184,7 +184,7 @@ def _packed_people(bodies: Mapping[str, Bodies], block: bytearray) -> dict[str, 
         "colours": {str(p): css(person_colour(p)) for p in people},
         "rows": [[int(main.frame[r]), int(main.person[r])] for r in rows],
         "worlds": {
-            name: _packed_points(b.verts[rows][:, few.kept], block)
+            name: _packed_points(b.verts[:, few.kept][rows], block)
             for name, b in bodies.items()
             if b.verts.shape == main.verts.shape
         },
