@@ -1,10 +1,15 @@
+import gc
+import os
 import sys
 from importlib.machinery import PathFinder
 
+import jaxtyping
 import pytest
-import torch
+import shape_checks
 
-torch.set_num_threads(1)  # threads that wait for one another are slower than one
+jaxtyping.jaxtyped = shape_checks.jaxtyped
+sys.dont_write_bytecode = False  # what is compiled is kept, and for commands in tests, too
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 
 class _Kernels(PathFinder):
@@ -18,17 +23,22 @@ class _Kernels(PathFinder):
 sys.meta_path.insert(0, _Kernels)  # before the one that checks shapes
 
 
-def pytest_sessionstart():
-    """Tests draw in double precision, too, which the program never does."""
+def pytest_collection():
+    """Only where tests run: they draw in double precision, too, which the program never does."""
+    gc.disable()  # nothing of what is imported goes
+    import torch
     from reference import reference_of
 
     from mover.geometry import raster
 
+    torch.set_num_threads(1)  # threads that wait for one another are slower than one
     raster._reference_of = reference_of
 
 
 def pytest_collection_modifyitems(items):
     """Tests of the documentation and of pages in a browser are marked by where they stand."""
+    gc.freeze()
+    gc.enable()
     for item in items:
         if item.path.stem.startswith("test_docs"):
             item.add_marker(pytest.mark.docs)

@@ -82,8 +82,13 @@ def _hits(rays, triangles):
     with np.errstate(divide="ignore", invalid="ignore"):
         u = rays @ np.cross(e2, -a).T / det
         v = rays @ cross.T / det
-        t = np.einsum("fi,fi->f", e2, cross) / det
-        hit = (u >= -1e-12) & (v >= -1e-12) & (u + v <= 1 + 1e-12) & (t > 0) & (det != 0)
-    first, last = np.where(hit, t, np.inf), np.where(hit, t, -np.inf)
-    index = np.where(hit.any(1), first.argmin(1), -1)
-    return first.min(1), last.max(1), index, hit.sum(1)
+        inside = (u >= -1e-12) & (v >= -1e-12) & (u + v <= 1 + 1e-12) & (det != 0)
+    ray, face = np.nonzero(inside)
+    t = np.einsum("fi,fi->f", e2, cross)[face] / det[ray, face]
+    ray, face, t = (x[t > 0] for x in (ray, face, t))
+    first, last = np.full(len(rays), np.inf), np.full(len(rays), -np.inf)
+    np.minimum.at(first, ray, t)
+    np.maximum.at(last, ray, t)
+    index, nearest = np.full(len(rays), -1), np.flatnonzero(t == first[ray])[::-1]
+    index[ray[nearest]] = face[nearest]
+    return first, last, index, np.bincount(ray, minlength=len(rays))

@@ -39,7 +39,7 @@ def masks_of(boxes: torch.Tensor, width: int, height: int) -> Masks:
 @pytest.fixture(scope="module")
 def right():
     """A capture whose parts lie on each other exactly."""
-    scene, walking = room(), walkers(people=2)
+    scene, walking = room(), walkers(24, people=2)
     camera, size = scene.camera, (scene.camera.width, scene.camera.height)
     scene = replace(scene, objects=tuple(
         replace(one, annotation=k) for k, one in enumerate(scene.objects)))  # fmt: skip

@@ -1,4 +1,4 @@
-"""The size and the language of the project: limits that only shrink.
+"""The size and the language of the project: limits that only shrink, and rules of style.
 
 A change that needs more than a limit allows says what it takes away; a change that needs less sets
 the limit to what is left (`python tests/test_house.py` prints all numbers).
@@ -12,6 +12,10 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+import torch
+from beartype.roar import BeartypeCallHintViolation
+
+from mover.geometry.boxes import iou2d
 
 HOME = Path(__file__).parents[1]
 LINES = {
@@ -30,7 +34,7 @@ LINES = {
     "src/mover/stages": 6_159,
     "bench": 7_468,
     "benchmarks": 1_183,
-    "tests": 30_115,
+    "tests": 30_171,
 }
 FILES = {"src/mover": 239, "bench": 40}
 LIMITS = {
@@ -57,6 +61,7 @@ PHRASES = (
 PLAIN = re.compile(rf"(?<![a-z_])(?:{'|'.join(WORDS)})(?![a-z_])")
 IN_A_NAME = re.compile(rf"(?<=_)(?:{'|'.join(WORDS)})\b|\b(?:{'|'.join(WORDS)})(?=_)")
 PHRASE = re.compile("|".join(f"(?:{phrase})" for phrase in PHRASES))
+RANDOM = {"rand", "randn", "randint", "randperm", "normal", "multinomial"}
 SMALL = 6  # lines of the body of a helper that is better written where it is called
 
 
@@ -81,9 +86,9 @@ def words_of(paths: Iterable[Path]) -> Counter[str]:
 
 
 @cache
-def trees() -> dict[Path, ast.Module]:
-    """The syntax of each file of the program."""
-    return {path: ast.parse(path.read_text(encoding="utf-8")) for path in python("src/mover")}
+def trees(folder: str = "src/mover") -> dict[Path, ast.Module]:
+    """The syntax of each file of the program, or of another folder."""
+    return {path: ast.parse(path.read_text(encoding="utf-8")) for path in python(folder)}
 
 
 def class_names_with_two_meanings() -> list[str]:
@@ -189,6 +194,53 @@ def test_pages_have_the_words_of_the_field() -> None:
 def test_what_reads_badly_becomes_no_more(check) -> None:
     found = check()
     assert len(found) <= LIMITS[check.__name__.replace("_", " ")], found
+
+
+def test_files_and_functions_are_short() -> None:
+    long = [path for path in python("src/mover", "bench") if path.read_text().count("\n") > 500]
+    for path, tree in (trees() | trees("bench")).items():
+        for node in ast.walk(tree):
+            is_function = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+            if is_function and node.end_lineno - node.lineno >= 60:
+                long.append(path / node.name)
+    assert not long
+
+
+def test_shape_checks_stay_alive() -> None:
+    late = "from __future__ import annotations"
+    assert not [p for p in python("src/mover", "bench") if late in p.read_text()]
+    iou2d(torch.zeros(3, 4), torch.zeros(3, 4))
+    for other in (torch.zeros(2, 4), torch.zeros(3, 4).long(), None):
+        with pytest.raises(BeartypeCallHintViolation):
+            iou2d(torch.zeros(3, 4), other)
+
+
+def test_no_device_and_no_hidden_randomness_is_named() -> None:
+    wrong = []
+    nodes = ((path, node) for path, tree in (trees() | trees("bench")).items()
+             for node in ast.walk(tree) if isinstance(node, ast.Call))  # fmt: skip
+    for path, call in nodes:
+        name = ast.unparse(call.func)
+        hidden = name.split(".")[0] == "torch" and name.split(".")[-1] in RANDOM
+        if hidden and "generator" not in {k.arg for k in call.keywords}:
+            wrong.append((path, name))
+        if name.endswith(".cuda") or "set_default" in name:
+            wrong.append((path, name))
+    assert not wrong
+
+
+def test_the_root_holds_packages_and_each_says_what_it_is() -> None:
+    for root in (HOME / "src" / "mover", HOME / "bench" / "mover_bench"):
+        assert {p.name for p in root.glob("*.py")} <= {"__init__.py", "__main__.py"}
+        folders = [p for p in root.iterdir() if p.is_dir() and any(p.glob("*.py"))]
+        assert len(folders) <= 13
+        assert all(ast.get_docstring(ast.parse((p / "__init__.py").read_text())) for p in folders)
+
+
+def test_nothing_of_the_program_needs_the_bench_but_the_tables_of_commands_and_formats() -> None:
+    root = HOME / "src" / "mover"
+    named = {p for p in root.glob("**/*.py") if "mover_bench" in p.read_text()}
+    assert named == {root / "app" / "cli" / "__init__.py", root / "io" / "formats.py"}
 
 
 if __name__ == "__main__":  # the numbers, to set the limits to

@@ -43,9 +43,16 @@ from mover.perceive.networks import Finds, link_people
 from mover.perceive.own import Video, own_objects, swaps
 from mover.perceive.steady import Drift
 from mover.perceive.video import Clip
+from mover.stages.camera import find_lens
 
 pytest.importorskip("cv2")
 SECOND = 30
+
+
+@pytest.fixture(autouse=True)
+def rough(monkeypatch):
+    """The lens is not asked for here: its error is estimated from few halves of the lines."""
+    monkeypatch.setattr(find_lens, "HALVES", 2)
 
 
 def perceived(source: Path, out: Path, fps: float = 5.0, lens: Path | None = None) -> Path:
