@@ -151,7 +151,7 @@ def fit_into(args: FitArgs, config: FitConfig | None = None) -> None:
     Raises:
         InputError: If what is given cannot be used.
     """
-    from mover.app.cli.progress import Bar
+    from mover.app.cli import Bar
     from mover.bodies import load_model
     from mover.core.records import rows_of
     from mover.fitting.bodies import FitInputs, fit_bodies

@@ -86,7 +86,7 @@ def layout_into(args: LayoutArgs, config: LayoutConfig) -> None:
     """Write the first scene into the capture."""
     import torch
 
-    from mover.app.cli.progress import Bar
+    from mover.app.cli import Bar
     from mover.core.run import Run
     from mover.furniture.library import unknown_names
     from mover.io.capture.bodies_file import read_bodies
@@ -278,7 +278,7 @@ def _pictures(
     """All of the capture but bodies, the first scene and what the user replaced."""
     import torch
 
-    from mover.app.cli.progress import Bar
+    from mover.app.cli import Bar
     from mover.core.run import Run
     from mover.perceive.capture import Finders, perceive
 
