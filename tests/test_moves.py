@@ -15,9 +15,14 @@ from mover.bodies.parts import LANDMARKS, BodyParts
 from mover.core.errors import InputError
 from mover.core.records import rows_of
 from mover.core.types import Bodies, Masks, People, Scene, SceneObject, Segment
-from mover.evaluate.contact import StandingMesh, nearness
-from mover.extensions.moved_furniture.movers import Between, Followed, follow_mover
-from mover.extensions.moved_furniture.stays import MoveInputs, find_moves
+from mover.evaluate.bodies import StandingMesh, nearness
+from mover.extensions.moved_furniture.stays import (
+    Between,
+    Followed,
+    MoveInputs,
+    find_moves,
+    follow_mover,
+)
 from mover.geometry.placement import changes, mover_at, placed_at, standing_meshes
 from mover.geometry.rle import decode, encode
 from mover.geometry.rotations import rot_y, wrap

@@ -143,9 +143,9 @@ def fitted(job: TableJob, given: Capture) -> Bodies:
         InputError: If there are no keypoints, or the body model is not known.
     """
     from mover.bodies import load_model
+    from mover.fitting import FITS as PRESETS_OF_FITS
     from mover.fitting.bodies import FitInputs, fit_bodies
-    from mover.fitting.config import FITS as PRESETS_OF_FITS
-    from mover.fitting.prior import prior_of
+    from mover.fitting.unknowns import prior_of
     from mover.io.people.found import Known
     from mover.io.people.keypoints import keypoints_from
 
