@@ -24,8 +24,8 @@ from mover.io.files.fields import At, existing, read_json
 from mover.io.files.meshes import load_arrays, mesh_of, write_mesh
 from mover.io.files.schema import rotation
 from mover.io.masks.coco import annotations_tree
+from mover.io.scenes.networks import CLASSES, FURNITURE
 from mover.io.scenes.placing import LEVEL, Matrix, Pieces, about_y, free_id
-from mover.io.scenes.total3d import CLASSES, FURNITURE
 
 SCENE = Path("models") / "scene.ply"
 LENS = {"w": 1920, "h": 1080, "fl_x": 1060.5317, "fl_y": 1060.3856, "cx": 951.2999, "cy": 536.7704}

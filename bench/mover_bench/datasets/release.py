@@ -27,12 +27,11 @@ from mover.io.capture.camera_file import camera_of
 from mover.io.capture.parts import Hints, Parts
 from mover.io.capture.scene_file import scene_of, scene_tree, write_scene
 from mover.io.files.cameras import read_camera_file
-from mover.io.files.fields import At, read_json
-from mover.io.files.npz import read_npy
+from mover.io.files.fields import At, read_json, read_npy
 from mover.io.masks.instance_files import list_instances
 from mover.io.masks.instances import Instance, Instances
+from mover.io.scenes.networks import read_shape, total3d_parts
 from mover.io.scenes.placing import FLIP, Matrix, level_of, load_from, posed
-from mover.io.scenes.total3d import read_shape, total3d_parts
 from mover_bench.datasets.true_boxes import (
     boxes_scene,
     floor_in,

@@ -27,8 +27,9 @@ from torch import Tensor
 from mover.bodies.skeleton import BODY, HANDS, JOINTS, PARENTS
 from mover.bodies.skinning import FLAT, HAND_POSES, FacePoints, Hands, SkinnedBody, vertex_subset
 from mover.core.errors import InputError
+from mover.core.files import BROKEN
 from mover.core.pickles import load_plain
-from mover.core.records import BROKEN, record
+from mover.core.records import record
 from mover.core.types import BodyPose
 
 Array = NDArray[Any]

@@ -259,7 +259,7 @@ def contacts(arguments: Sequence[str]) -> None:
     import torch
 
     from mover.io.capture.bodies_file import read_bodies, read_contacts
-    from mover.io.files.npz import write_npz
+    from mover.io.files.fields import write_npz
     from mover.pipeline.refine import find_posa
 
     if args.model_folder is not None:

@@ -17,8 +17,7 @@ from mover.app.cli.run import THREADS, reconstruct_into
 from mover.core.errors import InputError
 from mover.core.files import unreadable
 from mover.core.settings import Index, float_in
-from mover.perceive.config import PICTURES, LayoutConfig, PerceiveConfig
-from mover.perceive.needs import missing
+from mover.perceive.config import PICTURES, LayoutConfig, PerceiveConfig, missing
 from mover.pipeline.presets import PRESETS
 
 if TYPE_CHECKING:
@@ -126,7 +125,7 @@ class WeightsArgs:
 
 def bring_weights(arguments: Sequence[str]) -> None:
     """`mover weights`."""
-    from mover.perceive.needs import fetch
+    from mover.perceive.config import fetch
 
     args = tyro.cli(WeightsArgs, prog="mover weights", args=list(arguments))
     fetch(say, args.file)
