@@ -29,7 +29,7 @@ from mover.geometry.rotations import rot_y, wrap
 from mover.io.capture.edits import edit_scene, placement_of
 from mover.io.capture.folder import read_capture, write_capture
 from mover.io.capture.scene_file import read_scene, write_scene
-from mover_bench.experiment.measures import measure_moves
+from mover_bench.experiment.job import measure_moves
 
 SIZE = (90, 160)
 FPS = 5.0

@@ -67,12 +67,13 @@ FORMATS = (
     Format("scene", "boxes", "3D boxes (JSON); meshes come from the furniture library",
            "scenes.generic:box_parts"),
     *(
-        Format("dataset", name, what, f"mover_bench.datasets.{name}:{name}_parts")
-        for name, what in (
-            ("holisticmesh", "a folder of HolisticMesh: models/scene.ply, detections.json"),
-            ("release", "a sequence of the MOVER authors' release"),
-            ("prox", "PROX, qualitative or quantitative: one --recording"),
-            ("pigraphs", "PiGraphs: one --recording"),
+        Format("dataset", name, what, f"mover_bench.datasets.{module}:{name}_parts")
+        for name, module, what in (
+            ("holisticmesh", "release",
+             "a folder of HolisticMesh: models/scene.ply, detections.json"),
+            ("release", "release", "a sequence of the MOVER authors' release"),
+            ("prox", "prox", "PROX, qualitative or quantitative: one --recording"),
+            ("pigraphs", "pigraphs", "PiGraphs: one --recording"),
         )
     ),
     Format("masks", "masks", "masks alone: COCO, labelme, PNG, npz",
