@@ -31,9 +31,8 @@ from mover.io.capture.folder import read_capture
 from mover.io.capture.scene_file import read_scene
 from mover.pipeline.presets import PRESETS
 from mover.pipeline.reconstruct import reconstruct
-from mover_bench.experiment.job import noisy_room
-from mover_bench.experiment.measures import Trial
-from mover_bench.experiment.sets import SETS
+from mover_bench.experiment.job import Trial, noisy_room
+from mover_bench.rooms.config import SETS
 
 STORED = Path(__file__).with_name("gate.json")
 DEMO = ("demo", 0)

@@ -28,7 +28,7 @@ from mover.perceive.config import LayoutConfig
 from mover.perceive.layout import FirstScene, first_scene
 from mover.pipeline.presets import PRESETS
 from mover.pipeline.reconstruct import reconstruct
-from mover_bench.experiment.judge_i3db import picture_of
+from mover_bench.experiment.real import picture_of
 from mover_bench.rooms.config import NoiseConfig
 from mover_bench.rooms.known import KnownRoom, make_room
 from mover_bench.rooms.noise import add_noise

@@ -27,8 +27,7 @@ from mover.pipeline import objects
 from mover.pipeline.presets import PRESETS
 from mover.pipeline.reconstruct import reconstruct
 from mover.stages.objects.room_scale import SOURCES, ScaleKnown, common_scale
-from mover_bench.experiment.job import room_named
-from mover_bench.experiment.measures import Trial
+from mover_bench.experiment.job import Trial, room_named
 from mover_bench.experiment.tables import LEVEL, RESAMPLES
 
 CHOICES: dict[str, tuple[str, ...]] = {

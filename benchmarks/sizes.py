@@ -26,7 +26,7 @@ from mover.core.types import Capture, Detection, Masks, SceneObject
 from mover.geometry.rle import decode, encode
 from mover.io.capture.folder import read_capture, write_capture
 from mover.io.capture.pose_file import joined_bodies
-from mover_bench.rooms.moved import joined_people
+from mover_bench.rooms.moving import joined_people
 
 TIMES, ZOOM = 4, 2
 STEP = 0.02  # [m] between a copy and the next

@@ -44,8 +44,7 @@ from mover.io.capture.folder import read_capture
 from mover.io.capture.scene_file import read_scene
 from mover.io.files.fields import write_json
 from mover.pipeline.presets import PRESETS
-from mover_bench.experiment.sets import parse_seeds
-from mover_bench.rooms.config import NoiseConfig, RoomConfig
+from mover_bench.rooms.config import NoiseConfig, RoomConfig, parse_seeds
 from mover_bench.rooms.known import KnownRoom, draw_frame, make_room
 from mover_bench.rooms.noise import add_noise
 from mover_bench.rooms.seen import COCO, Seen

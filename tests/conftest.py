@@ -91,7 +91,7 @@ def quick(monkeypatch):
     from test_pipeline import light
 
     from mover.app.cli import video
-    from mover.fitting.config import FITS
+    from mover.fitting import FITS
     from mover.pipeline.presets import PRESETS
 
     monkeypatch.setattr(video, "LayoutConfig", lambda: LAYOUT)

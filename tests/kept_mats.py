@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 
 from mover.io.files.fields import At
-from mover.io.scenes import total3d
+from mover.io.scenes import networks
 
 TEXT = 124  # bytes of a file's head, with the time at which it was written
-READ, KEPT = total3d.load_mat, dict[tuple[str, bytes], At]()
+READ, KEPT = networks.load_mat, dict[tuple[str, bytes], At]()
 
 
 def load_once(path: Path) -> At:
@@ -20,4 +20,4 @@ def load_once(path: Path) -> At:
 
 @pytest.fixture(autouse=True)
 def mats_read_once(monkeypatch):
-    monkeypatch.setattr(total3d, "load_mat", load_once)
+    monkeypatch.setattr(networks, "load_mat", load_once)

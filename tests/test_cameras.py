@@ -29,7 +29,7 @@ from mover.io.capture.parts import Parts
 from mover.io.files.cameras import camera_of_photo, read_camera_file, tilt_of_photo
 from mover.io.files.fields import At
 from mover.io.formats import chosen, names
-from mover.io.people.paths import read_colmap, read_slam, read_tum
+from mover.io.people.cameras import read_colmap, read_slam, read_tum
 
 COUNT, FOCAL = 6, 0.625
 WIDTH, HEIGHT = 640, 360

@@ -32,9 +32,7 @@ from mover.pipeline.presets import PRESETS, Config
 from mover.stages.people.refine_bodies import RefinedBodies
 from mover_bench.cli import ExperimentArgs
 from mover_bench.experiment import job
-from mover_bench.experiment.job import Jobs, run_each, run_experiment
-from mover_bench.experiment.measures import Judge, Trial
-from mover_bench.experiment.sets import CHANGES, SETS, changed, parse_seeds
+from mover_bench.experiment.job import Jobs, Judge, Trial, run_each, run_experiment
 from mover_bench.experiment.tables import head_of, interval
 from mover_bench.experiment.variants import (
     LISTS,
@@ -45,6 +43,7 @@ from mover_bench.experiment.variants import (
     names_in,
     withheld,
 )
+from mover_bench.rooms.config import CHANGES, SETS, changed, parse_seeds
 
 FEW = EvaluateConfig(samples=200, bodies=2)
 KNOWN = dict(VARIANTS)

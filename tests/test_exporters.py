@@ -23,10 +23,9 @@ from mover.core.records import rows_of
 from mover.core.types import Bodies, BodyPose, Scene
 from mover.geometry.placement import place_object, placed_at
 from mover.geometry.rotations import axis_angle
-from mover.io.export.amass import export_amass
 from mover.io.export.finished import Finished, keyframes, read_finished
-from mover.io.export.glb import export_glb
-from mover.io.export.scene_glb import export_ply, placement_of
+from mover.io.export.posed import export_amass
+from mover.io.export.scene_glb import export_glb, export_ply, placement_of
 from mover.io.export.usd import export_usd
 from mover.io.formats import chosen
 from mover.io.people.found import Known

@@ -25,11 +25,9 @@ from mover.bodies.smpl_files import load_smpl
 from mover.core.errors import InputError
 from mover.core.types import Scene
 from mover.energy.body_terms import BODY_TERMS, deviation_term, robust_square, second_difference
-from mover.fitting import priors
+from mover.fitting import PAPER, PUBLISHED, STAGES, FitConfig, Stage, priors
 from mover.fitting.bodies import FitInputs, fit_bodies
-from mover.fitting.config import PAPER, PUBLISHED, STAGES, FitConfig, Stage
-from mover.fitting.energy import FitState
-from mover.fitting.ground import balance_cost, center_of_mass, standing_share
+from mover.fitting.energy import FitState, balance_cost, center_of_mass, standing_share
 from mover.fitting.start import placed
 from mover.fitting.tracks import best_path, motion_of, seen_of
 from mover.fitting.unknowns import Frame, Unknowns, place_of, points_of, rig_of

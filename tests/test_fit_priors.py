@@ -15,11 +15,9 @@ from mover.bodies.skinning import growth_of, open_body
 from mover.core.types import Bodies
 from mover.energy.body_terms import BODY_TERMS, SIGMA_HELD, deviation_term, robust_square
 from mover.evaluate.bodies import procrustes
-from mover.fitting import ground, priors
-from mover.fitting.bodies import FitInputs, fit_bodies
-from mover.fitting.config import STAGES, FitConfig, Stage
+from mover.fitting import STAGES, FitConfig, Stage, energy, priors
+from mover.fitting.bodies import FEW, FitInputs, at_most, bias_of, fit_bodies, noise_of, without
 from mover.fitting.energy import HEIGHT, UPPER, Seen
-from mover.fitting.noise import FEW, at_most, bias_of, noise_of, without
 from mover.fitting.start import BACK, LEGS, lying_guesses, turned_round, upright_guesses
 from mover.fitting.tracks import CALM, joint_speed, motion_of, stages_of
 from mover.fitting.unknowns import NO_FLOOR, Frame, Unknowns, floor_of, rig_of
@@ -131,7 +129,7 @@ def lying_down(depths, rises):
 
 def expected_distances(joints):
     rows = torch.arange(len(joints))
-    return ground.distances_of_lying_people(joints, UP, [rows], rows / 5)
+    return energy.distances_of_lying_people(joints, UP, [rows], rows / 5)
 
 
 def test_a_person_lying_along_the_view_is_expected_where_they_sat_before_and_after():
@@ -153,16 +151,16 @@ def test_a_body_across_the_view_shows_its_distance_itself():
 
 def test_a_leaning_floor_lies_where_its_soles_are():
     up = torch.nn.functional.normalize(torch.tensor([0.1, -1.0, 0.2]), dim=0)
-    leaned, height = ground.plane_of(torch.tensor([0.05, -0.03, -1.4]), up, None)
+    leaned, height = energy.plane_of(torch.tensor([0.05, -0.03, -1.4]), up, None)
     assert float(leaned.norm()) == pytest.approx(1)
     assert float(leaned @ up) == pytest.approx(1 / math.sqrt(1 + 0.05**2 + 0.03**2))
     assert float(height) == pytest.approx(-1.4)
     joints = torch.zeros(1, 22, 3)
-    soles = ground.soles_of(open_body())
+    soles = energy.soles_of(open_body())
     for side, more in (("left", 0.2), ("right", 0.0)):  # the left foot is lifted
         for joint, over in zip(("ankle", "foot"), soles, strict=True):
             joints[0, BODY.index(f"{side}_{joint}")] = (height + over + more) * leaned
-    assert float(ground.sole_heights(joints, soles, leaned)) == pytest.approx(-1.4, abs=1e-5)
+    assert float(energy.sole_heights(joints, soles, leaned)) == pytest.approx(-1.4, abs=1e-5)
 
 
 def test_upright_bodies_are_symmetric_and_nearly_straight_where_they_stand():
@@ -217,7 +215,7 @@ def sleeper(rolls: torch.Tensor, head: float) -> Bodies:
 def test_a_person_lying_along_the_view_has_the_head_where_it_is(roll, head):
     truth = sleeper(torch.full((10,), roll), head)
     found = fit_bodies(FitInputs(seen(truth, "coco17", noise=4.0), CAMERA, open_body()), STARTED)
-    along = (ground.trunk_of(found.bodies.joints) * ground.trunk_of(truth.joints)).sum(-1)
+    along = (energy.trunk_of(found.bodies.joints) * energy.trunk_of(truth.joints)).sum(-1)
     assert along.min() > 0.9
     miss = found.bodies.joints[:, :22] - truth.joints[:, :22]
     assert (miss - miss[:, :1]).norm(dim=-1).mean() < 0.12

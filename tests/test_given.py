@@ -45,7 +45,7 @@ from mover.stages.objects.gather_given import (
 from mover.stages.objects.prepare_objects import levelled
 from mover.stages.objects.starts import reference_yaw
 from mover.stages.people.find_depth import are_shapeless, nearer, size_spread
-from mover_bench.rooms.foreign import foreign_mesh
+from mover_bench.rooms.noise import foreign_mesh
 
 TURNS = torch.linspace(-math.pi, math.pi, 721)
 

@@ -13,9 +13,15 @@ from mover.geometry.boxes import box_of
 from mover.geometry.camera import pitch_roll, tilted
 from mover_bench.cli import ExperimentArgs
 from mover_bench.datasets.i3db import HALPE, JOINTS, read_i3db
-from mover_bench.experiment.judge_clips import judge_clips, tops_below
-from mover_bench.experiment.judge_clips import table_of as table_of_clips
-from mover_bench.experiment.judge_i3db import judge_i3db, overlaps, table_of, wrongly_placed
+from mover_bench.experiment.real import (
+    clips_table,
+    i3db_table,
+    judge_clips,
+    judge_i3db,
+    overlaps,
+    tops_below,
+    wrongly_placed,
+)
 
 REAL = Path(__file__).parents[2] / "shared" / "data" / "i3db"
 PITCH, FLOOR = math.radians(-5.0), -1.2
@@ -102,7 +108,7 @@ def test_what_is_no_i3db_is_a_sentence(change, words, tmp_path, monkeypatch) -> 
 
 def test_a_table_has_a_row_a_scene_and_the_means() -> None:
     keys = ("first", "run", "given", "run_given", "imapper", "run_pitch", "run_height", "stature")
-    lines = table_of({"a": dict.fromkeys(keys, 0.2), "b": dict.fromkeys(keys, 0.4)}).splitlines()
+    lines = i3db_table({"a": dict.fromkeys(keys, 0.2), "b": dict.fromkeys(keys, 0.4)}).splitlines()
     assert len(lines) == 5
     assert lines[-1].startswith("| mean | 0.300 |")
 
@@ -136,6 +142,6 @@ def test_a_folder_without_clips_is_refused_and_a_table_has_a_row_for_each_object
         with pytest.raises(InputError, match="--source: expected a folder of clips"):
             judge_clips(ExperimentArgs(set="clips", source=source))
     rows = [{"object": "bed_0", "size": "1.00 x 0.50 x 2.00", "iou": 0.7}, {"object": "chair_0"}]
-    table = table_of_clips({"a": {"stature": 1.7, "objects": rows}})
+    table = clips_table({"a": {"stature": 1.7, "objects": rows}})
     assert table.count("\n| a | 1.7 |") == 2
     assert "| bed_0 | 1.00 x 0.50 x 2.00 |" in table

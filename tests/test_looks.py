@@ -12,8 +12,14 @@ from test_export import textured as textured_box
 
 from mover.core.errors import InputError
 from mover.io.files.fields import At
-from mover.io.files.looks import companions, is_cloud, load_parts, looks_lost
-from mover.io.files.meshes import copy_mesh, load_arrays
+from mover.io.files.meshes import (
+    companions,
+    copy_mesh,
+    is_cloud,
+    load_arrays,
+    load_parts,
+    looks_lost,
+)
 
 RED = (200, 10, 10)
 OBJ = """{library}

@@ -16,9 +16,9 @@ from mover.bodies.keypoints import LAYOUTS
 from mover.core.errors import InputError
 from mover.core.types import Keypoints, Masks, People
 from mover.geometry.rle import decode, encode
-from mover.perceive import mediapipe, needs
+from mover.perceive import config, mediapipe
 from mover.perceive.config import ModelsConfig
-from mover.perceive.reference import Clean
+from mover.perceive.steady import Clean
 from mover.perceive.video import Clip, read_frames
 
 CLIPS = Path(__file__).parents[2] / "shared" / "data" / "clips"
@@ -192,19 +192,19 @@ class TestWeights:
     ):
         content = b"\0\0\0\0TFL3" + bytes(9)
         digest = hashlib.sha256(content).hexdigest()
-        monkeypatch.setattr(needs, "DIGESTS", dict.fromkeys(needs.DIGESTS, digest))
-        source = self.archive(tmp_path / "m.whl", dict.fromkeys(needs.IN_WHEEL, content))
-        assert needs.networks() is None
+        monkeypatch.setattr(config, "DIGESTS", dict.fromkeys(config.DIGESTS, digest))
+        source = self.archive(tmp_path / "m.whl", dict.fromkeys(config.IN_WHEEL, content))
+        assert config.networks() is None
         assert run_command("weights", ["mediapipe", str(source)]) == 0
-        assert needs.networks() is not None
+        assert config.networks() is not None
         assert capsys.readouterr().out.count("wrote") == 2
         heavy = tmp_path / "heavy.tflite"
         heavy.write_bytes(content + b"1")
-        needs.fetch(print, heavy)
-        bundle = dict.fromkeys(needs.IN_TASK, content + b"2")
+        config.fetch(print, heavy)
+        bundle = dict.fromkeys(config.IN_TASK, content + b"2")
         for source, last in ((heavy, b"1"), (self.archive(tmp_path / "h.task", bundle), b"2")):
-            needs.fetch(print, source)
-            assert (needs.folder() / needs.LANDMARKS).read_bytes()[-1:] == last
+            config.fetch(print, source)
+            assert (config.folder() / config.LANDMARKS).read_bytes()[-1:] == last
 
     @pytest.mark.parametrize(("name", "content", "words"), [
         ("m.whl", b"PK", "cannot be read"),
@@ -215,29 +215,29 @@ class TestWeights:
     def test_what_is_no_network_is_refused(self, name, content, words, tmp_path):
         path = tmp_path / name
         if content is None:
-            self.archive(path, dict.fromkeys(needs.IN_WHEEL, b"\0\0\0\0TFL3other"))
+            self.archive(path, dict.fromkeys(config.IN_WHEEL, b"\0\0\0\0TFL3other"))
         else:
             path.write_bytes(content)
         with pytest.raises(InputError, match=words):
-            needs.fetch(print, path)
+            config.fetch(print, path)
         with pytest.raises(InputError, match="no such file"):
-            needs.fetch(print, tmp_path / "none.whl")
-        assert needs.networks() is None
+            config.fetch(print, tmp_path / "none.whl")
+        assert config.networks() is None
 
     def test_a_download_that_fails_says_what_to_do(self, monkeypatch: pytest.MonkeyPatch):
         monkeypatch.setattr(sys, "executable", "false")
         with pytest.raises(InputError, match=r"mover weights mediapipe FILE\.whl"):
-            needs.fetch(print)
+            config.fetch(print)
 
     def test_only_what_is_needed_is_asked_for(self, monkeypatch: pytest.MonkeyPatch):
-        monkeypatch.setattr(needs.importlib.util, "find_spec", lambda _: None)
-        found = needs.missing(ModelsConfig(), (), mediapipe=True)
+        monkeypatch.setattr(config.importlib.util, "find_spec", lambda _: None)
+        found = config.missing(ModelsConfig(), (), mediapipe=True)
         assert [line.split(":")[0].split(",")[0] for line in found] == [
             "the package av", "the package ai_edge_litert",
             "MediaPipe's networks (Apache-2.0; 9 MB)",
         ]  # fmt: skip
         assert all("mediapipe" in line for line in found)
-        assert not any("mediapipe" in line for line in needs.missing(ModelsConfig()))
+        assert not any("mediapipe" in line for line in config.missing(ModelsConfig()))
         with pytest.raises(InputError, match="mover weights mediapipe"):
             mediapipe.pose_inputs(Clip("", 1, 1, torch.zeros(1), None))
 
@@ -245,12 +245,12 @@ class TestWeights:
 @pytest.mark.slow
 @pytest.mark.skipif(not CLIPS.is_dir(), reason="shared/data is not there")
 @pytest.mark.skipif(find_spec("ai_edge_litert") is None, reason="ai-edge-litert is not installed")
-@pytest.mark.skipif(needs.networks() is None, reason="mover weights mediapipe has not been run")
+@pytest.mark.skipif(config.networks() is None, reason="mover weights mediapipe has not been run")
 @pytest.mark.parametrize("name", ["s1_ADL_16", "s3_ADL_18", "s4_ADL_19"])
 def test_joints_and_masks_are_those_of_mediapipe(name: str):
     stored = np.load(CLIPS / name / "mediapipe_full.npz")
     wanted, misses, overlaps = stored["frame"].tolist(), list[float](), list[float]()
-    nets = [mediapipe.loaded(str(path)) for path in needs.networks() or ()]
+    nets = [mediapipe.loaded(str(path)) for path in config.networks() or ()]
     for index, _, pixels in read_frames(CLIPS / name / "video.mp4"):
         if index not in wanted:
             continue

@@ -30,7 +30,6 @@ from scipy.spatial.transform import Rotation
 
 from mover.core.types import Camera, Mesh
 from mover.evaluate import bodies as errors
-from mover.evaluate import contact as contacts
 from mover.evaluate import scene as metrics
 from mover.evaluate.scene import measure
 from mover.geometry.camera import project, tilted, to_camera
@@ -191,7 +190,7 @@ def test_of_two_that_stand_for_one_the_nearer_is_taken() -> None:
     assert found["chair"].id == "at20"
 
 
-BOX = [contacts.StandingMesh(cuboid(1, 1, 1))]  # its top is at 1
+BOX = [errors.StandingMesh(cuboid(1, 1, 1))]  # its top is at 1
 INSIDE, ABOVE = (0.92, 1.32), (1.04, 1.44)  # five rows, of which one is inside; none is
 
 
@@ -202,10 +201,10 @@ def test_collision_and_contact_are_shares_of_vertices_and_means_over_bodies(
     bodies, free, share, rows
 ):
     people = some_people(torch.cat([grid_body(*heights) for heights in bodies]))
-    touch = contacts.gather_touch(people, BOX, None, 10, 0.05)
-    assert contacts.non_collision(touch) == pytest.approx(free)
-    assert contacts.contact(touch) == pytest.approx(share)
-    assert contacts.contact_f1(touch) is None
+    touch = errors.gather_touch(people, BOX, None, 10, 0.05)
+    assert errors.non_collision(touch) == pytest.approx(free)
+    assert errors.contact(touch) == pytest.approx(share)
+    assert errors.contact_f1(touch) is None
     assert bodies != [ABOVE] or int((touch.near.surface <= 0.05).sum()) == rows
 
 
@@ -213,21 +212,21 @@ def test_contact_f1_compares_the_touching_vertices_with_the_true_ones():
     true = some_people(grid_body(1.0, 1.4, 9))  # heights 1, 1.05, 1.1, ...: two rows touch
     high = some_people(grid_body(1.04, 1.44, 9))  # one row touches
     for judged, expected in ((true, 1.0), (high, 2 * 9 / (9 + 18))):
-        truth = contacts.gather_truth(true, BOX, judged, 10, 0.0501)
-        touch = contacts.gather_touch(judged, BOX, truth, 10, 0.0501)
-        assert contacts.contact_f1(touch) == pytest.approx(expected)
-    none = contacts.Nearness(torch.full((1, 3), torch.inf), torch.full((1, 3), torch.inf))
-    assert contacts.contact_f1(contacts.Touch(none, none, none, 0.05)) == 1
+        truth = errors.gather_truth(true, BOX, judged, 10, 0.0501)
+        touch = errors.gather_touch(judged, BOX, truth, 10, 0.0501)
+        assert errors.contact_f1(touch) == pytest.approx(expected)
+    none = errors.Nearness(torch.full((1, 3), torch.inf), torch.full((1, 3), torch.inf))
+    assert errors.contact_f1(errors.Touch(none, none, none, 0.05)) == 1
 
 
 def test_contact_f1_is_paired_by_frame_and_person_not_by_row():
     bodies = some_people(torch.cat([grid_body(1.0, 1.4), grid_body(1.04, 1.44), grid_body(2, 3)]))
     order = torch.tensor([2, 0, 1])
     shuffled = replace(bodies, verts=bodies.verts[order], frame=bodies.frame[order])
-    truth = contacts.gather_truth(shuffled, BOX, bodies, 10, 0.05)
-    assert contacts.contact_f1(contacts.gather_touch(bodies, BOX, truth, 10, 0.05)) == 1
+    truth = errors.gather_truth(shuffled, BOX, bodies, 10, 0.05)
+    assert errors.contact_f1(errors.gather_touch(bodies, BOX, truth, 10, 0.05)) == 1
     later = replace(bodies, frame=bodies.frame + 1)  # frames 1, 2, 3: of the true 0, 1, 2
-    touch = contacts.gather_touch(later, BOX, truth, 10, 0.05)
+    touch = errors.gather_touch(later, BOX, truth, 10, 0.05)
     assert touch.shared.signed.shape[0] == 2
     assert touch.near.signed.shape[0] == 3
 
@@ -237,9 +236,9 @@ def test_distances_within_reach_are_those_to_all_objects_without_culling():
     verts = torch.rand(3, 400, 3, generator=rng, dtype=F64) * 3 - 1.5
     sphere = mesh_of(trimesh.creation.icosphere(3, 0.8))
     frame = torch.arange(3)
-    solid = [contacts.StandingMesh(sphere), *BOX]
-    found = contacts.nearness(verts, frame, solid, 0.05)
-    whole = contacts.nearness(verts, frame, solid, 10.0)
+    solid = [errors.StandingMesh(sphere), *BOX]
+    found = errors.nearness(verts, frame, solid, 0.05)
+    whole = errors.nearness(verts, frame, solid, 10.0)
     near = whole.surface <= 0.05
     assert near.sum() > 50
     assert torch.equal(near, found.surface <= 0.05)
@@ -252,7 +251,7 @@ def test_distances_within_reach_are_those_to_all_objects_without_culling():
 
 @given(st.integers(1, 500), st.integers(2, 100))
 def test_rows_are_thinned_evenly_and_each_at_most_once(rows, count):
-    picked = contacts.evenly(rows, count).tolist()
+    picked = errors.evenly(rows, count).tolist()
     assert len(set(picked)) == len(picked) == min(rows, count)
     assert picked[0] == 0
     assert picked[-1] == rows - 1

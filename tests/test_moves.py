@@ -15,16 +15,21 @@ from mover.bodies.parts import LANDMARKS, BodyParts
 from mover.core.errors import InputError
 from mover.core.records import rows_of
 from mover.core.types import Bodies, Masks, People, Scene, SceneObject, Segment
-from mover.evaluate.contact import StandingMesh, nearness
-from mover.extensions.moved_furniture.movers import Between, Followed, follow_mover
-from mover.extensions.moved_furniture.stays import MoveInputs, find_moves
+from mover.evaluate.bodies import StandingMesh, nearness
+from mover.extensions.moved_furniture.stays import (
+    Between,
+    Followed,
+    MoveInputs,
+    find_moves,
+    follow_mover,
+)
 from mover.geometry.placement import changes, mover_at, placed_at, standing_meshes
 from mover.geometry.rle import decode, encode
 from mover.geometry.rotations import rot_y, wrap
 from mover.io.capture.edits import edit_scene, placement_of
 from mover.io.capture.folder import read_capture, write_capture
 from mover.io.capture.scene_file import read_scene, write_scene
-from mover_bench.experiment.measures import measure_moves
+from mover_bench.experiment.job import measure_moves
 
 SIZE = (90, 160)
 FPS = 5.0

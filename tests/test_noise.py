@@ -17,11 +17,9 @@ from mover.geometry.nearest import to_surface
 from mover.geometry.rle import decode
 from mover.geometry.rotations import axis_angle, rot_y
 from mover.geometry.topology import is_closed
-from mover_bench.rooms import foreign
 from mover_bench.rooms.config import NoiseConfig
-from mover_bench.rooms.foreign import MAKERS, foreign_mesh
 from mover_bench.rooms.known import KnownRoom
-from mover_bench.rooms.noise import add_noise, slow
+from mover_bench.rooms.noise import MAKERS, add_noise, foreign_mesh, slow
 from mover_bench.rooms.noise_masks import coarse, grown, leaked, wobbled
 
 SILENT = NoiseConfig(
@@ -267,7 +265,7 @@ def test_merged_masks_are_the_union_of_two_and_one_object_is_missing(tiny: Known
 @pytest.mark.parametrize("maker", MAKERS, ids=lambda m: m.__name__.strip("_"))
 @pytest.mark.parametrize("name", ["chair", "shelf", "sofa"])
 def test_a_foreign_mesh_fills_the_box_and_is_another_shape(name, maker, monkeypatch):
-    monkeypatch.setattr(foreign, "MAKERS", (maker,))
+    monkeypatch.setattr("mover_bench.rooms.noise.MAKERS", (maker,))
     known = make_piece(name, np.random.default_rng(1), 0)
     mesh, again = (foreign_mesh(known, 0.03, np.random.default_rng(5)) for _ in range(2))
     assert torch.equal(mesh.verts, again.verts)

@@ -28,17 +28,17 @@ from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.folder import read_capture
 from mover.io.capture.scene_file import read_scene
 from mover_bench.cli import TableArgs
-from mover_bench.experiment import paper_rows as rows
+from mover_bench.experiment import paper_job as rows
 from mover_bench.experiment.job import Jobs
 from mover_bench.experiment.paper_job import (
     DONE,
+    TABLES,
     TableJob,
     disturb,
     key_of,
     measure,
     named_contacts,
 )
-from mover_bench.experiment.paper_rows import TABLES
 from mover_bench.experiment.paper_table import paper_table, planned
 from mover_bench.rooms.known import KnownRoom
 

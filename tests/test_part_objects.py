@@ -9,10 +9,18 @@ from analytic import FACES, SIZES, box_verts, make_inputs
 
 from mover.core.observe import Energy
 from mover.core.types import Layout, Mesh
-from mover.energy.prior_terms import FAR, OVERLAP, UPRIGHT
+from mover.energy.prior_terms import (
+    CELL,
+    FAR,
+    OVERLAP,
+    UPRIGHT,
+    WIDE,
+    Sections,
+    outline,
+    sections_of,
+)
 from mover.geometry.mesh import sample_surface
 from mover.geometry.rotations import rot_y
-from mover.geometry.sections import CELL, WIDE, Sections, outline, sections_of
 from mover.stages.objects.separate_objects import separate_objects, sharing
 
 WEIGHT = 0.3

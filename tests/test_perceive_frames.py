@@ -16,8 +16,17 @@ from mover.io.files.cameras import GUESSED
 from mover.perceive.capture import camera_by, lens_of
 from mover.perceive.config import FramesConfig
 from mover.perceive.own import Video
-from mover.perceive.reference import LEAST, median
-from mover.perceive.steady import Drift, align, find_drift, moved, steady_frames, warnings_of, warp
+from mover.perceive.steady import (
+    LEAST_FRAMES,
+    Drift,
+    align,
+    find_drift,
+    median,
+    moved,
+    steady_frames,
+    warnings_of,
+    warp,
+)
 from mover.perceive.video import Clip, read_picture, stamp_of
 
 BEDROOM = Path(__file__).parents[2] / "shared" / "data" / "sam2_bedroom" / "bedroom.mp4"
@@ -179,7 +188,7 @@ def test_the_clean_picture_is_the_room_that_people_never_hide_for_long():
     picture, hidden = median(pictures, shown)
     assert hidden.nonzero()[0].max() == hidden.nonzero()[1].max() == 4
     assert np.array_equal(picture[~hidden], room[~hidden])
-    assert median(pictures[: LEAST - 1], shown[: LEAST - 1])[1].all()
+    assert median(pictures[: LEAST_FRAMES - 1], shown[: LEAST_FRAMES - 1])[1].all()
 
 
 @pytest.mark.parametrize("missed", [(), (0, 2), (0, 2, 5)])

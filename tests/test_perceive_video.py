@@ -20,8 +20,7 @@ from mover.perceive.capture import Finders, lens_by_lines, perceive, restless
 from mover.perceive.config import ModelsConfig, PerceiveConfig
 from mover.perceive.networks import Finds
 from mover.perceive.own import Video
-from mover.perceive.reference import Clean, detections_in, grown, hidden_mask, reference_of
-from mover.perceive.steady import Drift
+from mover.perceive.steady import Clean, Drift, detections_in, grown, hidden_mask, reference_of
 from mover.perceive.video import Clip
 
 W, H, FRAMES = 128, 96, 7

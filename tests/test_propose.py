@@ -30,7 +30,7 @@ from mover.geometry.rotations import rot_y
 from mover.io.capture.scene_file import read_scene
 from mover.stages.masks import small_camera
 from mover_bench.experiment.job import noisy_room
-from mover_bench.experiment.sets import SETS
+from mover_bench.rooms.config import SETS
 
 COUNT = 12  # frames: 2.4 s
 LYING = turned(pose(ARMS_DOWN, COUNT), -torch.pi / 2, 0.0, 0.0)

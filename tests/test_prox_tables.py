@@ -18,10 +18,9 @@ from mover.pipeline.presets import PRESETS
 from mover_bench.cli import TableArgs
 from mover_bench.datasets.pigraphs import NAMES
 from mover_bench.experiment import paper_job
-from mover_bench.experiment import paper_rows as rows
+from mover_bench.experiment import paper_job as rows
 from mover_bench.experiment.job import Jobs
-from mover_bench.experiment.paper_job import TableJob, do_job
-from mover_bench.experiment.paper_rows import TABLES
+from mover_bench.experiment.paper_job import TABLES, TableJob, do_job
 from mover_bench.experiment.paper_table import asked, paper_table
 from mover_bench.rooms.known import KnownRoom
 
@@ -108,7 +107,7 @@ def test_every_kind_of_row_is_made_from_the_files_of_prox(name, captures, tmp_pa
             line = numbers[part.title, row.label]
             assert line["recordings"] == "1"
             lacking = [c for c in part.columns if not line.get(c)]
-            whole = rows.STD in part.columns and row is rows.ABLATION[-1]  # "-" in the paper
+            whole = rows.STD in part.columns and row is rows.ABLATION_ROWS[-1]  # "-" in the paper
             assert lacking == ([rows.STD] if whole else []), (part.title, row.label)
     if name == "prox-quantitative":  # the fits are the truth: under a level camera they lean
         baseline, camgp = (numbers["People [mm]", row] for row in ("baseline", "+ CamGP"))

@@ -11,11 +11,9 @@ from PIL import Image
 from tiny_capture import HEIGHT, WIDTH, write_capture
 
 from mover.app.cli import run_command
-from mover.app.pictures import paint
-from mover.app.pictures.config import RenderConfig
+from mover.app.pictures import RenderConfig, paint
 from mover.app.pictures.film import save_film, video_pictures
-from mover.app.pictures.overlay import backdrop
-from mover.app.pictures.render import render_result, render_room
+from mover.app.pictures.overlay import backdrop, render_result, render_room
 from mover.core.errors import InputError
 from mover.core.types import Segment
 from mover.geometry.camera import project, to_camera

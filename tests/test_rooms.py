@@ -18,11 +18,9 @@ from mover.furniture.library import SEATS, canonical, make_piece
 from mover.geometry.camera import to_world
 from mover.geometry.placement import place_object, placed_at
 from mover.geometry.rle import decode
-from mover_bench.experiment.job import true_room, with_noise
-from mover_bench.experiment.measures import seat_height
-from mover_bench.experiment.sets import SETS, parse_seeds
+from mover_bench.experiment.job import seat_height, true_room, with_noise
 from mover_bench.rooms.compose import Plan, draw_plan, make_view, overlap
-from mover_bench.rooms.config import NoiseConfig, RoomConfig
+from mover_bench.rooms.config import SETS, NoiseConfig, RoomConfig, parse_seeds
 from mover_bench.rooms.gait import duration, stations, walk
 from mover_bench.rooms.known import Actor, KnownRoom, build, make_room
 from mover_bench.rooms.motion import Stage, Stop, Task, perform

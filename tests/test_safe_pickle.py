@@ -24,8 +24,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import sparse
 
-from mover.bodies.smpl_files import load_smpl
-from mover.bodies.transfer import read_matrix
+from mover.bodies.smpl_files import load_smpl, read_matrix
 from mover.core import pickles
 from mover.core.errors import InputError
 from mover.core.pickles import load_plain

@@ -26,8 +26,14 @@ from mover.geometry.topology import is_closed
 from mover.geometry.watertight import close_mesh
 from mover.io.capture.scene_file import write_scene
 from mover.io.export.finished import read_finished
-from mover.io.export.mjcf import export_mjcf
-from mover.io.export.solids import DENSITY, ConvexConfig, ConvexInputs, cut_into_convex, solids_of
+from mover.io.export.solids import (
+    DENSITY,
+    ConvexConfig,
+    ConvexInputs,
+    cut_into_convex,
+    export_mjcf,
+    solids_of,
+)
 from mover.io.files.meshes import write_mesh
 
 BOXES = ("chair", "table")

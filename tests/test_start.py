@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from mover.app.cli.progress import Bar
+from mover.app.cli import Bar
 from mover.core.observe import Step
 from mover.geometry import warp_start
 
@@ -31,7 +31,7 @@ assert len(set(folder)) == 1, folder
 COMPILE = """
 from mover.geometry.warp_start import kernels
 from mover.core.observe import Step
-from mover.app.cli.progress import Bar
+from mover.app.cli import Bar
 with Bar() as bar:
     bar(Step("gather", 0, 1))
     kernels("lookup", "cpu")

@@ -9,8 +9,7 @@ import torch
 from make_keypoints import random_pose
 from scipy import sparse
 
-from mover.bodies.smpl_files import FOLDER, load_smpl
-from mover.bodies.transfer import as_smplx, find_matrix, read_matrix
+from mover.bodies.smpl_files import FOLDER, as_smplx, find_matrix, load_smpl, read_matrix
 from mover.core.errors import InputError
 from mover.fitting.start import _by_matrix
 

@@ -17,9 +17,8 @@ from mover.app.cli.video import VideoArgs, video_to_room
 from mover.core.errors import InputError
 from mover.io.capture.bodies_file import read_bodies, write_bodies
 from mover.io.files.fields import write_json
-from mover.perceive import needs
-from mover.perceive.config import ModelsConfig
-from mover.perceive.needs import FACTS, missing
+from mover.perceive import config
+from mover.perceive.config import FACTS, ModelsConfig, missing
 from mover.perceive.steady import first_cut
 
 NAMES = ("first", "second")
@@ -132,12 +131,12 @@ class TestNetworks:
     def test_everything_that_is_missing_is_said_at_once_with_licence_size_and_what_to_do(
         self, monkeypatch: pytest.MonkeyPatch
     ):
-        monkeypatch.setattr(needs.importlib.util, "find_spec", lambda _: None)
+        monkeypatch.setattr(config.importlib.util, "find_spec", lambda _: None)
         found = "; ".join(missing(ModelsConfig(), mediapipe=True))
         for name, facts in FACTS.items():
             assert f"hf download {name}" in found
             assert all(fact in found for fact in facts)
-        assert all(f"the package {name}" in found for name in needs.PACKAGES)
+        assert all(f"the package {name}" in found for name in config.PACKAGES)
 
     def test_all_default_networks_have_their_facts(self):
         models = ModelsConfig()

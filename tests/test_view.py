@@ -20,7 +20,7 @@ from PIL import Image
 from test_pipeline import light
 from test_report import browser, differ
 
-from mover.app.viewer.session import read_shown
+from mover.app.viewer.drawing import read_shown
 from mover.core import records
 from mover.energy.config import Adam
 from mover.geometry.boxes import box_of

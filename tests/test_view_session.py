@@ -9,9 +9,8 @@ import pytest
 import torch
 from little_room import GROUND, room, walkers
 
-from mover.app.viewer.drawing import DrawnPeople
-from mover.app.viewer.panels import numbers_of
-from mover.app.viewer.session import Shown, start_session
+from mover.app.viewer.drawing import DrawnPeople, Shown, start_session
+from mover.app.viewer.show import numbers_of
 from mover.core.records import rows_of
 from mover.io.capture.edits import Delete, Place, placement_of, read_edits, write_edits
 

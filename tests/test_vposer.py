@@ -9,9 +9,9 @@ from torch import nn
 
 from mover.bodies.skinning import open_body
 from mover.core.errors import InputError
+from mover.fitting import STAGES, FitConfig
 from mover.fitting.bodies import FitInputs, fit_bodies
-from mover.fitting.config import STAGES, FitConfig
-from mover.fitting.prior import (
+from mover.fitting.unknowns import (
     decoded,
     encoded,
     gram_schmidt,

@@ -74,10 +74,9 @@ class TableArgs:
 def experiment(arguments: Sequence[str]) -> None:
     """`mover experiment`."""
     args = parsed(ExperimentArgs, "mover experiment", arguments)
-    from mover.app.cli.progress import Bar
+    from mover.app.cli import Bar
     from mover_bench.experiment.job import run_experiment
-    from mover_bench.experiment.judge_clips import judge_clips
-    from mover_bench.experiment.judge_i3db import judge_i3db
+    from mover_bench.experiment.real import judge_clips, judge_i3db
 
     real = {"i3db": judge_i3db, "clips": judge_clips}  # all other sets are known rooms
     with Bar() as bar:
@@ -88,7 +87,7 @@ def experiment(arguments: Sequence[str]) -> None:
 def show_paper_table(arguments: Sequence[str]) -> None:
     """`mover paper-table`."""
     args = parsed(TableArgs, "mover paper-table", arguments)
-    from mover.app.cli.progress import Bar
+    from mover.app.cli import Bar
     from mover_bench.experiment.paper_table import paper_table, planned
 
     if not args.look:

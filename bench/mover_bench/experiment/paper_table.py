@@ -20,9 +20,9 @@ from mover.pipeline.presets import PRESETS
 from mover_bench.cli import TableArgs
 from mover_bench.datasets import prox_files
 from mover_bench.experiment.job import Pool, run_each
-from mover_bench.experiment.paper_job import DONE, TableJob, fits_of, key_of
-from mover_bench.experiment.paper_rows import (
+from mover_bench.experiment.paper_job import (
     BASELINE,
+    DONE,
     ERRORS,
     FITS,
     INITIAL,
@@ -31,7 +31,10 @@ from mover_bench.experiment.paper_rows import (
     TABLES,
     PaperTable,
     Part,
+    TableJob,
     TableRow,
+    fits_of,
+    key_of,
     variants,
 )
 from mover_bench.experiment.tables import LOG, markdown

@@ -19,8 +19,8 @@ from mover.core.observe import Observer, Step
 from mover.core.records import plain
 from mover.evaluate.evaluation import METRICS
 from mover_bench.cli import ExperimentArgs
-from mover_bench.experiment.sets import set_named
 from mover_bench.experiment.variants import VARIANTS
+from mover_bench.rooms.config import set_named
 
 Frame = Any  #: a `pandas.DataFrame`
 LOG = "log.txt"

@@ -12,7 +12,7 @@ from mover.core.records import rows_of
 from mover.core.types import Bodies, Capture
 from mover.pipeline.presets import PRESETS, READINGS, Config, literally
 from mover.stages.config import LensConfig, SpreadConfig
-from mover_bench.experiment.sets import CHANGES
+from mover_bench.rooms.config import CHANGES
 
 Given = Literal["all", "true contacts", "no contact", "no people"]
 SEGMENTS = 10  # of each length, as in the paper

@@ -19,7 +19,7 @@ from mover.geometry.camera import project, tilted, to_camera
 from mover.geometry.raster import first_hit
 from mover_bench.rooms.config import PlanConfig, RoomConfig, Rule
 from mover_bench.rooms.placed import Placed, corners, on_floor, verts_on_floor
-from mover_bench.rooms.turns import facing, heading_of
+from mover_bench.rooms.poses import facing, heading_of
 
 Pose = tuple[float, float, float]
 Size = tuple[float, float, float]

@@ -10,8 +10,20 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mover.core.records import record
-from mover_bench.rooms.poses import LEG, STANCE, Person, Posture
-from mover_bench.rooms.turns import X, Y, about, apply, facing, heading_of, left_of, smooth
+from mover_bench.rooms.poses import (
+    LEG,
+    STANCE,
+    Person,
+    Posture,
+    X,
+    Y,
+    about,
+    apply,
+    facing,
+    heading_of,
+    left_of,
+    smooth,
+)
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline

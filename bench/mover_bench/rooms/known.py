@@ -30,11 +30,18 @@ from mover_bench.rooms.compose import Plan, draw_plan, make_view
 from mover_bench.rooms.config import ActConfig, RoomConfig
 from mover_bench.rooms.motion import DOOR, Performance, Stage, Stop, Task, perform
 from mover_bench.rooms.placed import ROOMY, Placed, free_of
-from mover_bench.rooms.poses import angles, jointed, make_person, rows
+from mover_bench.rooms.poses import (
+    angles,
+    facing,
+    from_vector,
+    jointed,
+    make_person,
+    rows,
+    to_vector,
+)
 from mover_bench.rooms.render import Sight, box_of_mask, draw_bodies, encode, look_at, see
 from mover_bench.rooms.resting import table_stand
 from mover_bench.rooms.truth import GAPE, NONE, Nearness, nearness
-from mover_bench.rooms.turns import facing, from_vector, to_vector
 
 
 @contextmanager

@@ -14,9 +14,8 @@ from mover.geometry.warp_start import mapped
 from mover_bench.rooms import resting
 from mover_bench.rooms.gait import duration, stations, walk
 from mover_bench.rooms.placed import NoWayError, Placed, way
-from mover_bench.rooms.poses import SIDES, Person, Posture, blend, chain, rows
+from mover_bench.rooms.poses import SIDES, Person, Posture, blend, chain, facing, rows, smooth
 from mover_bench.rooms.truth import faults
-from mover_bench.rooms.turns import facing, smooth
 
 DOOR = 0.3  # [m], from a seat or table to where one turns round
 

@@ -8,7 +8,7 @@ from torch import Tensor
 from mover.core.records import record
 from mover.furniture.pieces import Furniture
 from mover_bench.rooms.gait import Floor
-from mover_bench.rooms.turns import facing, left_of
+from mover_bench.rooms.poses import facing, left_of
 
 SIGNS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])  # of the corners of a footprint
 FAR = 0.03  # [m], signed distances beyond this are not distinguished

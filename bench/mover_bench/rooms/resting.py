@@ -14,14 +14,21 @@ from mover_bench.rooms.poses import (
     SIDES,
     Person,
     Posture,
+    X,
+    Y,
+    about,
+    apply,
     blend,
     chain,
     chest_of,
+    facing,
+    from_vector,
+    left_of,
     moved,
     rows,
+    smooth,
 )
 from mover_bench.rooms.truth import approach, gap, laid, part, rest_on
-from mover_bench.rooms.turns import X, Y, about, apply, facing, from_vector, left_of, smooth
 
 SIT_TIME = 1.8  # [s]
 BOW = np.radians(32)  # how far one bends forward on the way down

@@ -16,8 +16,7 @@ from torch import Tensor
 
 from mover.bodies.skeleton import BODY, FINGERS, SIDES
 from mover.bodies.skinning import ASSETS, SkinnedBody, open_body, vertex_subset, zero_pose
-from mover.bodies.smpl_files import KINDS, load_smpl
-from mover.bodies.transfer import solved
+from mover.bodies.smpl_files import KINDS, load_smpl, solved
 from mover.core.errors import InputError
 from mover.core.records import record, to_device
 from mover.core.types import Bodies

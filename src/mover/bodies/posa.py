@@ -22,8 +22,8 @@ from torch import Tensor
 from torch.nn.functional import group_norm, linear
 
 from mover.core.errors import InputError
+from mover.core.files import BROKEN
 from mover.core.pickles import load_weights
-from mover.core.records import BROKEN
 from mover.core.types import Bodies
 from mover.geometry.rotations import axis_angle, rot_x
 

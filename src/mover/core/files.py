@@ -6,11 +6,21 @@ import re
 import shutil
 import tempfile
 import time
+import zipfile
+import zlib
 from collections.abc import Generator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tokenize import TokenError
 
 from mover.core.errors import InputError
+
+BROKEN = (
+    OSError, ValueError, KeyError, IndexError, EOFError, RuntimeError, MemoryError,
+    TypeError, AttributeError, zipfile.BadZipFile, zlib.error,
+    SyntaxError, TokenError,  # numpy's headers are Python
+)  # fmt: skip
+"""What reading a broken file of arrays raises."""
 
 LEFT = 3600  # [s], no file is written for so long
 INSTEAD = {

@@ -23,8 +23,7 @@ import numpy as np
 import torch
 
 from mover.core.errors import InputError
-from mover.core.files import unreadable
-from mover.core.records import BROKEN
+from mover.core.files import BROKEN, unreadable
 
 LARGEST = 2 << 30  # of a file, of an array, of the tree that a file unfolds to [bytes]
 REPEATED = 1 << 26  # of a tensor that repeats its numbers [bytes]

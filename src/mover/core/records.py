@@ -5,12 +5,9 @@ import hashlib
 import json
 import types
 import typing
-import zipfile
-import zlib
 from collections.abc import Callable, Mapping
 from functools import cache, wraps
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any, TypeVar, dataclass_transform
 
 import numpy as np
@@ -20,15 +17,9 @@ from jaxtyping import jaxtyped
 from torch import Tensor
 
 from mover.core.errors import InputError
-from mover.core.files import replacing
+from mover.core.files import BROKEN, replacing
 
 T = TypeVar("T")
-BROKEN = (
-    OSError, ValueError, KeyError, IndexError, EOFError, RuntimeError, MemoryError,
-    TypeError, AttributeError, zipfile.BadZipFile, zlib.error,
-    SyntaxError, TokenError,  # numpy's headers are Python
-)  # fmt: skip
-"""What reading a broken file of arrays raises."""
 MOST = 1000  # combinations of shapes that a record remembers
 _check = beartype(conf=BeartypeConf(is_pep484_tower=True))
 

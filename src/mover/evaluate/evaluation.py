@@ -18,13 +18,19 @@ from mover.core.records import record
 from mover.core.run import Run
 from mover.core.settings import Count, Metres, int_in
 from mover.core.types import Bodies, Scene
-from mover.evaluate import contact
 from mover.evaluate import scene as compare
 from mover.evaluate.bodies import (
     GROUND_METRICS,
     POSE_METRICS,
+    TOUCH_METRICS,
+    Furniture,
     Standing,
+    Touch,
+    close_meshes,
     feet_places,
+    furniture_of,
+    gather_touch,
+    gather_truth,
     gather_twins,
     soles_of,
 )
@@ -40,7 +46,7 @@ METRICS: dict[str, compare.Metric[Any]] = {
     **compare.OBJECT_METRICS,
     **compare.HARM_METRICS,
     **compare.SCENE_METRICS,
-    **contact.TOUCH_METRICS,
+    **TOUCH_METRICS,
     **compare.CAMERA_METRICS,
     **GROUND_METRICS,
     **POSE_METRICS,
@@ -117,9 +123,7 @@ def evaluate(
     objects = compare.measure_objects(scenes, matched, sides, config.samples, config.boxes)
     people, touch = after.bodies or before.bodies, None
     if true.bodies is not None and people is not None:
-        touch = contact.gather_truth(
-            true.bodies, true.furniture, people, config.bodies, config.reach
-        )
+        touch = gather_truth(true.bodies, true.furniture, people, config.bodies, config.reach)
 
     def of(key: str) -> dict[str, float]:
         judged = asked[key]
@@ -131,9 +135,7 @@ def evaluate(
         values |= compare.measure(compare.CAMERA_METRICS, compare.Sight(judged.scene, true.scene))
         if judged.bodies is None:
             return values
-        near = contact.gather_touch(
-            judged.bodies, judged.furniture, touch, config.bodies, config.reach
-        )
+        near = gather_touch(judged.bodies, judged.furniture, touch, config.bodies, config.reach)
         feet = judged.bodies.verts[:, judged.soles] if len(judged.soles) else None
         if config.feet == "contacts":
             named = bodies.named if judged is after else None
@@ -200,7 +202,7 @@ def table(metrics: Mapping[str, Any], shown: Sequence[str] | None = None) -> str
 
 
 def evaluate_people(
-    bodies: Bodies, floor: float | None, furniture: contact.Furniture, truth: Bodies | None = None
+    bodies: Bodies, floor: float | None, furniture: Furniture, truth: Bodies | None = None
 ) -> dict[str, float]:
     """How people of a room fit its floor [m] and closed furniture, and how wrong they are.
 
@@ -209,20 +211,20 @@ def evaluate_people(
     soles = members(parts_of(bodies), *SOLES)
     feet = bodies.verts[:, soles] if bool(soles.any()) else None
     config = EvaluateConfig()
-    near = contact.gather_touch(bodies, furniture, None, config.bodies, config.reach)
+    near = gather_touch(bodies, furniture, None, config.bodies, config.reach)
     return _people(bodies, near, feet, floor, config.ground_tolerance, truth)
 
 
 def _people(
     bodies: Bodies,
-    near: contact.Touch,
+    near: Touch,
     feet: Float[Tensor, "bodies points 3"] | None,
     floor: float | None,
     tolerance: float,
     truth: Bodies | None,
 ) -> dict[str, float]:
     """The metrics of a scene's people; what they or the truth do not give is left out."""
-    values = compare.measure(contact.TOUCH_METRICS, near)
+    values = compare.measure(TOUCH_METRICS, near)
     if floor is not None and feet is not None:
         values |= compare.measure(GROUND_METRICS, Standing(feet[..., 1] - floor, tolerance))
     twins = None if truth is None else gather_twins(bodies, truth)
@@ -239,15 +241,13 @@ def _populate(scenes: tuple[Scene, Scene, Scene], people: EvaluatedBodies) -> li
         b if b and len(b.frame) else None for b in (people.initial, people.result, people.truth)
     ]
     peopled = list(zip(scenes, rows, strict=True))
-    closed = contact.close_meshes(
-        item for scene, b in peopled if b is not None for item in scene.objects
-    )
+    closed = close_meshes(item for scene, b in peopled if b is not None for item in scene.objects)
     found: list[_Populated] = []
     for scene, b in peopled:
         soles, furniture = torch.zeros(0, dtype=torch.long), ()
         if b is not None:
             soles = soles_of(b, scene.camera)
-            furniture = compare.doubled(tuple(contact.furniture_of(scene.objects, closed)))
+            furniture = compare.doubled(tuple(furniture_of(scene.objects, closed)))
         world = None if b is None else in_world(compare.doubled(b), scene.camera)
         found.append(_Populated(compare.doubled(scene), world, soles, furniture))
     return found

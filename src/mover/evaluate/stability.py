@@ -15,8 +15,7 @@ from mover.core.errors import InputError
 from mover.core.run import Run
 from mover.core.types import Scene
 from mover.evaluate.scene import Metric
-from mover.io.export.mjcf import body_name, mjcf_of, text_of
-from mover.io.export.solids import Solid, solids_of
+from mover.io.export.solids import Solid, body_name, mjcf_of, solids_of, text_of
 
 SECONDS = 2.0  # [s] of gravity
 STAYS = (0.01, math.radians(1))  # [m], [rad]; less is stable; such a share is REST3D's (2026)

@@ -1,4 +1,11 @@
-"""From keypoints to bodies: the batch fit of a whole video."""
+"""From keypoints to bodies: the batch fit of a whole video, and the bias that noise leaves in it.
+
+A limb that looks too short is bent, one that looks too long cannot be: noise makes people look
+larger, so that they are put too near. How much depends on how noisy their keypoints are, how large
+they are seen and what they do. So the bodies that were found are seen once more with as much noise
+and fitted again (a parametric bootstrap): what changes is what noise had changed before. The
+share of the known noise that the fit leaves gives the size of the unknown one.
+"""
 
 import dataclasses
 from dataclasses import dataclass
@@ -12,14 +19,84 @@ from mover.bodies.skinning import FLAT, SkinnedBody, growth_of, shaped, widths_o
 from mover.core.observe import Energy, Observer, Step, silent
 from mover.core.records import record, rows_of
 from mover.core.types import Bodies, BodyPose, Camera, Keypoints, rows_by_person
-from mover.fitting import ground, tracks, unknowns
-from mover.fitting.config import FitConfig, Stage
-from mover.fitting.energy import FitState
-from mover.fitting.noise import Bias, at_most, bias_of, noise_of, without
-from mover.fitting.prior import encoded
+from mover.fitting import FitConfig, Stage, tracks, unknowns
+from mover.fitting.energy import (
+    HEIGHT,
+    FitState,
+    Seen,
+    distances_of_lying_people,
+    sole_heights,
+    soles_of,
+    standing_share,
+)
 from mover.fitting.priors import UNKNOWN, kind_of, lasting_of, stature_of
 from mover.fitting.start import begin, begin_from
+from mover.fitting.unknowns import Unknowns, encoded
 from mover.geometry.rotations import rotation_vectors
+
+NORMAL = 0.6745  # median of the absolute value of a normal number
+FEW = 20  # rows of a person at which half of the estimated bias is applied
+
+
+@record
+class Bias:
+    """What noise does to people."""
+
+    betas: Float[Tensor, "people shape"]
+    depth: Float[Tensor, " people"]
+    """Logarithm of how much farther they are, beside what the shape says."""
+
+
+def noise_of(
+    off: Float[Tensor, "bodies keypoints 2"],
+    seen: Seen,
+    person: Int[Tensor, " bodies"],
+    left: float,
+) -> Float[Tensor, " bodies"]:
+    """Noise of the keypoints of each body's person along each axis [px]; 0: not known.
+
+    From the median of how far they are `off` their projections by a fit [px], so that joints which
+    are swapped or guessed at the wrong place do not count. A fit leaves the share `left` of the
+    variance of the noise.
+    """
+    noise, there = off.new_zeros(len(off)), seen.weight > 0
+    for one in person.unique():
+        mine = person == one
+        size = off[mine][there[mine]].abs().flatten()
+        if len(size):
+            noise[mine] = size.median() / (NORMAL * left**0.5)
+    return noise
+
+
+def at_most(seen: Seen, noise: Float[Tensor, " bodies"], pose: float) -> Tensor:
+    """Weights, none larger than the noise [px] allows beside a pose prior of this weight."""
+    most = pose * seen.height / HEIGHT / noise.clamp_min(1e-6)
+    return torch.minimum(seen.weight, most[:, None])
+
+
+def bias_of(
+    found: Unknowns,
+    again: Unknowns,
+    person: Int[Tensor, " bodies"],
+    share: Float[Tensor, " bodies"],
+) -> Bias:
+    """What changed in the bodies `found` that were seen and fitted `again`, with noise.
+
+    `share` is how much of the variance of that noise is really in the keypoints.
+    """
+    count = torch.bincount(person, minlength=len(found.betas)).to(found.place)
+    moved = again.place[:, 2] - found.place[:, 2]
+    each = [person == k for k in range(len(count))]
+    depth = torch.stack([moved[mine].median() for mine in each])
+    known = count / (count + FEW) * torch.stack([share[mine].median() for mine in each])
+    return Bias(known[:, None] * (again.betas - found.betas), known * depth)
+
+
+def without(at: Unknowns, bias: Bias, person: Int[Tensor, " bodies"]) -> Unknowns:
+    """The bodies without what noise did to them; their poses stay."""
+    place = torch.cat([at.place[:, :2], (at.place[:, 2] - bias.depth[person])[:, None]], -1)
+    return dataclasses.replace(at, place=place, betas=at.betas - bias.betas)
+
 
 SHAPES = 10
 EXPRESSION = 10
@@ -111,8 +188,8 @@ def _on_a_floor(state: FitState, model: SkinnedBody) -> FitState:
     seen = state.seen
     if not state.config.stands:
         return state
-    soles = ground.soles_of(model)
-    low = ground.sole_heights(state.points.joints, soles, seen.up)
+    soles = soles_of(model)
+    low = sole_heights(state.points.joints, soles, seen.up)
     level = low.median() if seen.floor is None else low.new_tensor(seen.floor)
     floor = torch.stack([torch.zeros_like(level), torch.zeros_like(level), level])
     return state.at_values(floor=floor).given(soles=soles)
@@ -160,7 +237,7 @@ def _stages(
     state = state.given(motion=tracks.motion_of(some, speed, config))
     for index, stage in enumerate(stages):
         if state.at.floor.numel():  # the share of the bodies that their legs carry
-            standing = ground.standing_share(state.points.joints, state.plane[0])
+            standing = standing_share(state.points.joints, state.plane[0])
             state = state.given(standing=standing)
         if index == 1 and config.left:
             state = _lowered(state, dataclasses.replace(stage, steps=config.noise_steps), free)
@@ -207,7 +284,7 @@ def _laid(state: FitState, keypoints: Keypoints) -> FitState:
     at, seen = state.at, state.seen
     time = keypoints.frame / keypoints.fps
     rows = rows_by_person(keypoints.frame, keypoints.person)
-    about = ground.distances_of_lying_people(state.points.joints, seen.up, rows, time)
+    about = distances_of_lying_people(state.points.joints, seen.up, rows, time)
     free = about.isnan()
     if bool(free.all()):
         return state

@@ -24,16 +24,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.bodies.skeleton import BODY
-from mover.bodies.smpl_files import load_smpl
-from mover.bodies.transfer import ANGLES, as_smplx, find_matrix, read_matrix
+from mover.bodies.smpl_files import ANGLES, as_smplx, find_matrix, load_smpl, read_matrix
 from mover.core.errors import InputError
 from mover.core.observe import Energy
 from mover.core.records import record, rows_of, with_rows
 from mover.core.types import Bodies, BodyPose, Camera, Keypoints, rows_by_person
 from mover.energy.body_terms import robust_square
-from mover.fitting.config import FitConfig, Stage
-from mover.fitting.energy import FitState, Seen
-from mover.fitting.ground import LIES, NEIGHBOURS, SITS, trunk_of
+from mover.fitting import FitConfig, Stage
+from mover.fitting.energy import LIES, NEIGHBOURS, SITS, FitState, Seen, trunk_of
 from mover.fitting.priors import HIPS, KNEES, resting, spreads
 from mover.fitting.tracks import best_path, every_so_often
 from mover.fitting.unknowns import Frame, Rig, Unknowns, place_of, points_of, solve

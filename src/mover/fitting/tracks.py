@@ -12,7 +12,7 @@ from mover.core.errors import InputError
 from mover.core.records import record
 from mover.core.types import Camera, Keypoints, rows_by_person
 from mover.energy.body_terms import gather_neighbours
-from mover.fitting.config import FitConfig, Stage
+from mover.fitting import FitConfig, Stage
 from mover.fitting.energy import Seen, TrackMotion
 from mover.fitting.priors import kind_of, resting, spreads
 from mover.fitting.unknowns import Rig

@@ -57,22 +57,23 @@ class Format:
 
 FORMATS = (
     Format("capture", "folder", "a capture folder", "capture.folder:read_capture"),
-    Format("capture", "total3d", "a folder of Total3D or Im3D", "scenes.total3d:read_total3d"),
+    Format("capture", "total3d", "a folder of Total3D or Im3D", "scenes.networks:read_total3d"),
     Format("scene", "folder", "another capture, or a part of one", "capture.folder:folder_parts"),
     Format("scene", "total3d", "a folder of Total3D or Implicit3D (input/ and output/, or one)",
-           "scenes.total3d:total3d_parts"),
+           "scenes.networks:total3d_parts"),
     Format("scene", "sam3d", "a folder of SAM 3D Objects: meshes and their poses",
-           "scenes.sam3d:sam3d_parts"),
-    Format("scene", "glb", "a glTF scene: each node an object", "scenes.glb_scene:glb_parts"),
+           "scenes.networks:sam3d_parts"),
+    Format("scene", "glb", "a glTF scene: each node an object", "scenes.generic:glb_parts"),
     Format("scene", "boxes", "3D boxes (JSON); meshes come from the furniture library",
-           "scenes.box_scene:box_parts"),
+           "scenes.generic:box_parts"),
     *(
-        Format("dataset", name, what, f"mover_bench.datasets.{name}:{name}_parts")
-        for name, what in (
-            ("holisticmesh", "a folder of HolisticMesh: models/scene.ply, detections.json"),
-            ("release", "a sequence of the MOVER authors' release"),
-            ("prox", "PROX, qualitative or quantitative: one --recording"),
-            ("pigraphs", "PiGraphs: one --recording"),
+        Format("dataset", name, what, f"mover_bench.datasets.{module}:{name}_parts")
+        for name, module, what in (
+            ("holisticmesh", "release",
+             "a folder of HolisticMesh: models/scene.ply, detections.json"),
+            ("release", "release", "a sequence of the MOVER authors' release"),
+            ("prox", "prox", "PROX, qualitative or quantitative: one --recording"),
+            ("pigraphs", "pigraphs", "PiGraphs: one --recording"),
         )
     ),
     Format("masks", "masks", "masks alone: COCO, labelme, PNG, npz",
@@ -96,13 +97,13 @@ FORMATS = (
             ("wham", "wham_output.pkl of WHAM"),
         )
     ),
-    Format("cameras", "colmap", "images.txt of COLMAP's text model", "people.paths:read_colmap"),
-    Format("cameras", "gvhmr", "slam_results.pt of GVHMR", "people.paths:read_slam"),
-    Format("cameras", "megasam", "*_sgd_cvd_hr.npz of MegaSaM", "people.paths:read_megasam"),
-    Format("cameras", "tum", "a trajectory in TUM's format", "people.paths:read_tum"),
-    Format("cameras", "vggt", "predictions.npz of VGGT", "people.paths:read_vggt"),
-    Format("cameras", "vipe", "a folder of ViPE", "people.paths:read_vipe"),
-    Format("cameras", "wham", "slam_results.pth of WHAM", "people.paths:read_slam"),
+    Format("cameras", "colmap", "images.txt of COLMAP's text model", "people.cameras:read_colmap"),
+    Format("cameras", "gvhmr", "slam_results.pt of GVHMR", "people.cameras:read_slam"),
+    Format("cameras", "megasam", "*_sgd_cvd_hr.npz of MegaSaM", "people.cameras:read_megasam"),
+    Format("cameras", "tum", "a trajectory in TUM's format", "people.cameras:read_tum"),
+    Format("cameras", "vggt", "predictions.npz of VGGT", "people.cameras:read_vggt"),
+    Format("cameras", "vipe", "a folder of ViPE", "people.cameras:read_vipe"),
+    Format("cameras", "wham", "slam_results.pth of WHAM", "people.cameras:read_slam"),
     *(
         Format("keypoints", name, what, "people.keypoints:read_instances", {"layout": layout})
         for name, layout, what in (
@@ -112,12 +113,12 @@ FORMATS = (
         )
     ),
     Format("keypoints", "openpose", "a folder of OpenPose", "people.keypoints:read_openpose"),
-    Format("export", "glb", "the room with moving people, one file", "export.glb:export_glb"),
+    Format("export", "glb", "the room with moving people, one file", "export.scene_glb:export_glb"),
     Format("export", "usd", "the same as binary USD", "export.usd:export_usd"),
-    Format("export", "mjcf", "a world of MuJoCo", "export.mjcf:export_mjcf"),
+    Format("export", "mjcf", "a world of MuJoCo", "export.solids:export_mjcf"),
     Format("export", "ply", "each object by itself", "export.scene_glb:export_ply"),
     Format("export", "contacts", "labels of contact", "export.contacts:export_contacts"),
-    Format("export", "amass", "people with the keys of AMASS", "export.amass:export_amass"),
+    Format("export", "amass", "people with the keys of AMASS", "export.posed:export_amass"),
 )  # fmt: skip
 """Names are unique within `capture`, `people`, `cameras`, `keypoints`, `export`, and `IMPORTED`."""
 

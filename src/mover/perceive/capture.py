@@ -51,8 +51,16 @@ from mover.perceive.layout import FirstScene, Picture
 from mover.perceive.mediapipe import PoseInputs, find_poses
 from mover.perceive.networks import Finds, JointsInputs
 from mover.perceive.own import FEW, Say, Video, own_keypoints, own_masks, own_objects, same_people
-from mover.perceive.reference import Clean, detections_in, hidden_mask, reference_of
-from mover.perceive.steady import Drift, find_drift, steady_frames, warnings_of
+from mover.perceive.steady import (
+    Clean,
+    Drift,
+    detections_in,
+    find_drift,
+    hidden_mask,
+    reference_of,
+    steady_frames,
+    warnings_of,
+)
 from mover.perceive.video import (
     Clip,
     TakeInputs,

@@ -31,8 +31,8 @@ from mover.core.records import record
 from mover.core.types import Keypoints, Masks, People
 from mover.geometry.rle import decode, encode
 from mover.io.people.found import followed
-from mover.perceive.needs import COMMAND, install, networks
-from mover.perceive.reference import Clean
+from mover.perceive.config import COMMAND, install, networks
+from mover.perceive.steady import Clean
 from mover.perceive.video import Clip, read_picture
 
 LAYOUT = "mediapipe33"

@@ -24,8 +24,7 @@ from mover.core.records import record
 from mover.core.types import Keypoints, Masks, People
 from mover.geometry.rle import encode, joined, mask_boxes
 from mover.io.people.found import followed
-from mover.perceive.config import ModelsConfig, PerceiveConfig
-from mover.perceive.needs import absent, install
+from mover.perceive.config import ModelsConfig, PerceiveConfig, absent, install
 from mover.perceive.video import Clip, read_picture
 
 log = logging.getLogger(__name__)

@@ -21,8 +21,7 @@ from mover.core.observe import Observer, Step, silent
 from mover.core.records import fingerprint, record
 from mover.io.files.images import opened
 from mover.io.people.values import natural
-from mover.perceive.config import PICTURES, FramesConfig
-from mover.perceive.needs import install
+from mover.perceive.config import PICTURES, FramesConfig, install
 
 LARGEST_AREA = 1 << 26  # [px²], of a frame
 QUALITY = 95  # of JPEG

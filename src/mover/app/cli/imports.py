@@ -139,7 +139,7 @@ def _parts(args: ImportArgs, main: "Parts", hints: "Hints") -> "list[Parts]":
 
     from mover.io.capture.parts import Parts, image_parts
     from mover.io.files.cameras import with_known
-    from mover.io.files.npz import read_npz
+    from mover.io.files.fields import read_npz
 
     given, extra = args.camera is not None or args.fov is not None, dict[str, Any]()
     lens = hints.camera if given else main.camera or hints.camera

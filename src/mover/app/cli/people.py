@@ -13,7 +13,7 @@ from mover.app.cli import say
 from mover.app.cli.config import chosen_config, parsed, parsed_with
 from mover.core.errors import InputError
 from mover.core.settings import Index, Rate, float_in
-from mover.fitting.config import FITS, FitConfig
+from mover.fitting import FITS, FitConfig
 from mover.io.formats import chosen, listing, names
 
 TOOLS = f"The tool that wrote the source; see docs/data.md.\n{listing('people', 'keypoints')}"
@@ -65,7 +65,7 @@ def bodies(arguments: Sequence[str]) -> None:
     tracks = tracks_of(args.tracks)
     known = Known(camera, args.focal, args.faces, args.fps, args.gender, args.first, tracks=tracks)
     if args.vposer is not None:
-        from mover.fitting.prior import load_vposer, vposer_prior
+        from mover.fitting.unknowns import load_vposer, vposer_prior
 
         known = replace(known, decode=vposer_prior(load_vposer(args.vposer)).decode)
     if args.tool in names("keypoints"):
@@ -151,11 +151,11 @@ def fit_into(args: FitArgs, config: FitConfig | None = None) -> None:
     Raises:
         InputError: If what is given cannot be used.
     """
-    from mover.app.cli.progress import Bar
+    from mover.app.cli import Bar
     from mover.bodies import load_model
     from mover.core.records import rows_of
     from mover.fitting.bodies import FitInputs, fit_bodies
-    from mover.fitting.prior import prior_of
+    from mover.fitting.unknowns import prior_of
     from mover.io.capture.bodies_file import read_bodies, write_bodies
     from mover.pipeline.estimates import poor_fits
     from mover.stages.people.select_frames import select_frames

@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 
 from mover.app.cli import say
 from mover.app.cli.config import REFINE_SETTINGS, parsed, parsed_with
-from mover.app.pictures.config import STILL, RenderConfig, check_ending
+from mover.app.pictures import STILL, RenderConfig, check_ending
 from mover.core.errors import InputError
 from mover.core.settings import Index, int_in
 from mover.io.formats import chosen, names
@@ -160,7 +160,7 @@ def render(arguments: Sequence[str]) -> None:
     """`mover render`."""
     args = parsed(RenderArgs, "mover render", arguments)
     _check_result(args.out)
-    from mover.app.pictures.render import render_result
+    from mover.app.pictures.overlay import render_result
 
     count = render_result(args.out, args.to, args.config, args.capture)
     what = "one picture" if count == 1 else f"{count} pictures"
@@ -237,7 +237,7 @@ def refine(arguments: Sequence[str]) -> None:
     )
     import torch
 
-    from mover.app.cli.progress import Bar
+    from mover.app.cli import Bar
     from mover.pipeline.refine import measure_people, refine_result, without
 
     torch.set_num_threads(1)
@@ -259,7 +259,7 @@ def contacts(arguments: Sequence[str]) -> None:
     import torch
 
     from mover.io.capture.bodies_file import read_bodies, read_contacts
-    from mover.io.files.npz import write_npz
+    from mover.io.files.fields import write_npz
     from mover.pipeline.refine import find_posa
 
     if args.model_folder is not None:

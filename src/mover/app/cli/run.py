@@ -81,7 +81,7 @@ def reconstruct_into(
     """Run the main job on the edited capture and write its result."""
     import torch
 
-    from mover.app.cli.progress import Bar
+    from mover.app.cli import Bar
     from mover.app.results import write_results
     from mover.core.observe import Step
     from mover.core.run import Run

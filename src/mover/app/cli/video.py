@@ -17,8 +17,7 @@ from mover.app.cli.run import THREADS, reconstruct_into
 from mover.core.errors import InputError
 from mover.core.files import unreadable
 from mover.core.settings import Index, float_in
-from mover.perceive.config import PICTURES, LayoutConfig, PerceiveConfig
-from mover.perceive.needs import missing
+from mover.perceive.config import PICTURES, LayoutConfig, PerceiveConfig, missing
 from mover.pipeline.presets import PRESETS
 
 if TYPE_CHECKING:
@@ -86,7 +85,7 @@ def layout_into(args: LayoutArgs, config: LayoutConfig) -> None:
     """Write the first scene into the capture."""
     import torch
 
-    from mover.app.cli.progress import Bar
+    from mover.app.cli import Bar
     from mover.core.run import Run
     from mover.furniture.library import unknown_names
     from mover.io.capture.bodies_file import read_bodies
@@ -126,7 +125,7 @@ class WeightsArgs:
 
 def bring_weights(arguments: Sequence[str]) -> None:
     """`mover weights`."""
-    from mover.perceive.needs import fetch
+    from mover.perceive.config import fetch
 
     args = tyro.cli(WeightsArgs, prog="mover weights", args=list(arguments))
     fetch(say, args.file)
@@ -278,7 +277,7 @@ def _pictures(
     """All of the capture but bodies, the first scene and what the user replaced."""
     import torch
 
-    from mover.app.cli.progress import Bar
+    from mover.app.cli import Bar
     from mover.core.run import Run
     from mover.perceive.capture import Finders, perceive
 

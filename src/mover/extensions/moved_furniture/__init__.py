@@ -18,8 +18,15 @@ from mover.bodies.parts import parts_of
 from mover.core.records import rows_of
 from mover.core.run import Run
 from mover.core.types import Capture, Detection, Masks, People, Room, SceneObject, Segment
-from mover.extensions.moved_furniture.movers import Between, Followed, follow_mover
-from mover.extensions.moved_furniture.stays import STEP, MoveInputs, Stay, find_moves
+from mover.extensions.moved_furniture.stays import (
+    STEP,
+    Between,
+    Followed,
+    MoveInputs,
+    Stay,
+    find_moves,
+    follow_mover,
+)
 from mover.geometry.path import is_still
 from mover.geometry.placement import ENDLESS, hit_floor, placed_at
 from mover.geometry.rle import encode, tight_box

@@ -14,7 +14,7 @@ from torch import Tensor
 from mover.core.types import Camera, Capture, Masks, Mesh, People
 from mover.geometry.rle import encode, tight_box
 from mover.io.capture.annotations_file import people_to_json
-from mover.io.capture.build import build_capture
+from mover.io.capture.folder import build_capture
 from mover.io.capture.parts import Parts
 from mover.io.capture.scene_file import scene_tree
 from mover.io.files.fields import At

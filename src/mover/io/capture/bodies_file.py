@@ -15,9 +15,19 @@ from mover.bodies.corrected import has_mean_shape
 from mover.core.errors import InputError
 from mover.core.types import Bodies
 from mover.io.capture.pose_file import NEEDED, pose_of, posed, reproduces
-from mover.io.files.fields import FASTEST, SLOWEST, At, Warn, listed
-from mover.io.files.looks import check_faces
-from mover.io.files.npz import AMASS, is_amass, read_npy, read_npz, write_npz
+from mover.io.files.fields import (
+    AMASS,
+    FASTEST,
+    SLOWEST,
+    At,
+    Warn,
+    is_amass,
+    listed,
+    read_npy,
+    read_npz,
+    write_npz,
+)
+from mover.io.files.meshes import check_faces
 from mover.io.formats import names
 from mover.io.people.values import named
 

@@ -19,16 +19,20 @@ from mover.furniture.library import canonical
 from mover.io.capture import agreement as agree
 from mover.io.capture.annotations_file import detections_of, people_of
 from mover.io.capture.bodies_file import bodies_of, bodies_to_arrays, write_bodies
-from mover.io.capture.build import build_capture
 from mover.io.capture.camera_file import camera_of, measured_tilt, turned
 from mover.io.capture.edits import carried, facing
-from mover.io.capture.folder import REFERENCE, folder_parts, read_capture, write_trees
+from mover.io.capture.folder import (
+    REFERENCE,
+    build_capture,
+    folder_parts,
+    read_capture,
+    write_trees,
+)
 from mover.io.capture.parts import UNKNOWN, Parts
 from mover.io.capture.pose_file import joined_bodies
 from mover.io.capture.tracks import numbers_beside, renumbered
-from mover.io.files.fields import At, listed, write_json
+from mover.io.files.fields import At, listed, write_json, write_npz
 from mover.io.files.images import write_image
-from mover.io.files.npz import write_npz
 from mover.io.masks.coco import annotations_tree
 
 log = logging.getLogger(__name__)

@@ -12,7 +12,7 @@ from mover.core.errors import InputError
 from mover.core.types import ContactLabels
 from mover.io.export.finished import Exported, Finished, Up, tracks_of
 from mover.io.export.solids import AXES, floor_height
-from mover.io.files.npz import read_npz, write_npz
+from mover.io.files.fields import read_npz, write_npz
 
 FORMAT, FILE = "mover-contact-labels", "contacts.npz"
 SURE = 0.5  # confidence from which `object_contact` says yes

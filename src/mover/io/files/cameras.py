@@ -16,9 +16,8 @@ from mover.core.errors import InputError
 from mover.core.files import unreadable
 from mover.core.types import Tilt
 from mover.geometry.camera import tilted
-from mover.io.files.fields import LARGEST, At, read_json
+from mover.io.files.fields import LARGEST, At, read_json, read_npy, read_npz
 from mover.io.files.images import ORIENTATION, opened
-from mover.io.files.npz import read_npy, read_npz
 from mover.io.files.schema import Positive, Side, checked
 
 log = logging.getLogger(__name__)

@@ -17,9 +17,8 @@ from torch import Tensor
 from mover.core.errors import InputError
 from mover.core.files import reason, replacing, unreadable
 from mover.core.types import Camera, DepthImage
-from mover.io.files.fields import At
+from mover.io.files.fields import At, read_npy, read_npz
 from mover.io.files.meshes import inside
-from mover.io.files.npz import read_npy, read_npz
 
 log = logging.getLogger(__name__)
 

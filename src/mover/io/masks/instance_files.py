@@ -14,9 +14,17 @@ from mover.io.files.fields import FASTEST, LAST_INDEX, SLOWEST, At, read_json
 from mover.io.files.images import image_size
 from mover.io.files.schema import Id, Index, Share, Side, Text, checked
 from mover.io.masks.coco import COCO_CLASSES, COCO_IDS, MOST_THINGS, CategoryFields, is_drawn
-from mover.io.masks.instances import Instance, Instances, Names, Size, code_in, frames_of, mask_code
+from mover.io.masks.instances import (
+    Instance,
+    Instances,
+    Names,
+    Size,
+    code_in,
+    frames_of,
+    labelme_instances,
+    mask_code,
+)
 from mover.io.masks.label_images import PICTURES, pictures_in, read_label_images, read_mask_arrays
-from mover.io.masks.labelme import labelme_instances
 from mover.io.people.values import PICKLES, lone, natural, number_in
 
 LEAST_SCORE = 0.3  # of MMDetection, which writes everything that it thought of

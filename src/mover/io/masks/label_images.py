@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from mover.core.errors import InputError
 from mover.io.capture.parts import UNKNOWN
-from mover.io.files.fields import At, read_json
+from mover.io.files.fields import At, read_json, read_npy
 from mover.io.files.images import opened
-from mover.io.files.npz import read_npy
 from mover.io.masks.instances import Instance, Instances, Names, Size, code_of, frames_of
 from mover.io.people.values import natural, number_in, read_any
 

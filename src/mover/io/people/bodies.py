@@ -18,8 +18,8 @@ from mover.io.capture.tracks import join_pieces, renumbered, seen_at
 from mover.io.files.fields import LARGEST, At, listed
 from mover.io.files.meshes import read_mesh
 from mover.io.formats import chosen as format_of
+from mover.io.people.cameras import refocused
 from mover.io.people.found import UNTRACKED, Found, Known, followed
-from mover.io.people.lens import refocused
 from mover.io.people.values import named
 
 

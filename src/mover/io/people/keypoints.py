@@ -19,8 +19,7 @@ from mover.bodies.keypoints import LAYOUTS as JOINTS
 from mover.core.errors import InputError
 from mover.core.types import Keypoints
 from mover.io.capture.bodies_file import scalar
-from mover.io.files.fields import FASTEST, LARGEST, SLOWEST, At, read_json
-from mover.io.files.npz import read_npz, write_npz
+from mover.io.files.fields import FASTEST, LARGEST, SLOWEST, At, read_json, read_npz, write_npz
 from mover.io.formats import chosen
 from mover.io.people.found import Known, followed
 from mover.io.people.values import files_of, frames_in, lone, named, need, numbers, tensor

@@ -24,8 +24,16 @@ from mover.core.types import BodyPose
 from mover.io.capture.pose_file import GENDERS, NEEDED, moved
 from mover.io.files.fields import At
 from mover.io.people import values as v
+from mover.io.people.cameras import (
+    assumed_lens,
+    from_weak,
+    lens,
+    lens_of,
+    movement,
+    own_lens,
+    tilting,
+)
 from mover.io.people.found import UNTRACKED, Found, Known, joined
-from mover.io.people.lens import assumed_lens, from_weak, lens, lens_of, movement, own_lens, tilting
 from mover.io.people.values import need
 
 Names = tuple[str, ...]

@@ -15,8 +15,17 @@ from torch import Tensor
 
 from mover.core.errors import InputError
 from mover.core.pickles import load_plain
-from mover.io.files.fields import LARGEST, LAST_INDEX, At, existing, read_json
-from mover.io.files.npz import AMASS, is_amass, read_npy, read_npz
+from mover.io.files.fields import (
+    AMASS,
+    LARGEST,
+    LAST_INDEX,
+    At,
+    existing,
+    is_amass,
+    read_json,
+    read_npy,
+    read_npz,
+)
 from mover.io.people.found import Known
 
 log = logging.getLogger(__name__)

@@ -15,9 +15,8 @@ from mover.core.observe import Energy, Observer, silent
 from mover.core.types import Layout, Objects
 from mover.energy.config import Adam
 from mover.energy.minimize import minimize
-from mover.energy.prior_terms import apart_term, gather_solids
+from mover.energy.prior_terms import Sections, apart_term, gather_solids, sections_of
 from mover.geometry.boxes import Box, corners
-from mover.geometry.sections import Sections, sections_of
 
 NEAR = 0.1  # [m], boxes whose circles are no nearer are not looked at
 METHOD = Adam(200, 0.01, 0.001, beta2=0.98)  # 80 cm at most
