@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from mover.core.types import Capture, Masks, SceneObject
+from mover.core.types import Capture, Detection, Masks, SceneObject
 from mover.geometry.placement import place_object
 from mover.geometry.rle import decode, encode, tight_box
 from mover.geometry.rotations import rot_x, rot_z
@@ -125,14 +125,31 @@ def people_inverted(capture: Capture) -> Capture | None:
     return seen and replace(capture, people=replace(seen, masks=other(seen.masks)))
 
 
-def furniture_inverted(capture: Capture) -> Capture | None:
-    """Masks of furniture, and their boxes."""
-    if any(d.mask is None for d in capture.detections):
+def furniture_inverted(some: slice) -> Change:
+    """Masks of some of the furniture, and their boxes."""
+
+    def inverted(d: Detection) -> Detection:
+        assert d.mask is not None
+        mask = other(d.mask)
+        return replace(d, mask=mask, box=tight_box(decode(mask, 0)).to(d.box))
+
+    def changed(capture: Capture) -> Capture | None:
+        if any(d.mask is None for d in capture.detections):
+            return None
+        found = list(capture.detections)
+        found[some] = map(inverted, found[some])
+        return replace(capture, detections=tuple(found))
+
+    return changed
+
+
+def one_late(capture: Capture) -> Capture | None:
+    """One person of several in later frames than the others."""
+    bodies = capture.bodies
+    if bodies is None or capture.people is None or len(bodies.person.unique()) < 2:
         return None
-    masks = [other(d.mask) for d in capture.detections if d.mask is not None]
-    return replace(capture, detections=tuple(
-        replace(d, mask=mask, box=tight_box(decode(mask, 0)).to(d.box))
-        for d, mask in zip(capture.detections, masks, strict=True)))  # fmt: skip
+    late = bodies.frame + 5 * (bodies.person == bodies.person.min())
+    return replace(capture, bodies=replace(bodies, frame=late))
 
 
 def lens(zoom: float, right: float = 0.0) -> Change:
@@ -190,7 +207,11 @@ FAULTS: dict[str, tuple[str, Change]] = {
     "tracks of masks in pieces": ("different tracks", tracks(lambda p, f: 10 * p + f // 40 + 3)),
     "annotations exchanged": ("exchanged", exchanged),
     "masks of people inverted": ("inverted", people_inverted),
-    "masks of furniture inverted": ("inverted", furniture_inverted),
+    "masks of furniture inverted": ("inverted", furniture_inverted(slice(None))),
+    "one mask of furniture inverted": ("is inverted", furniture_inverted(slice(1))),
+    "one person 5 frames late": ("5 frames late", one_late),
+    "one object 5 times too large": ("times too large", mesh(
+        lambda one: 5 * one.mesh.verts, first=True)),
     "meshes with +z up": ("side (+z is up)", mesh(lambda one: one.mesh.verts @ Z_UP.mT)),
     "one mesh with +z up": ("is on the side", mesh(
         lambda one: one.mesh.verts @ Z_UP.mT, first=True)),

@@ -25,7 +25,7 @@ from mover.core.types import (
 )
 from mover.furniture.library import canonical, make_piece
 from mover.furniture.pieces import Furniture
-from mover.geometry.warp_start import beside, mapped
+from mover.geometry.warp_start import mapped
 from mover_bench.rooms.compose import Plan, draw_plan, make_view
 from mover_bench.rooms.config import ActConfig, RoomConfig
 from mover_bench.rooms.motion import DOOR, Performance, Stage, Stop, Task, perform
@@ -41,7 +41,7 @@ from mover_bench.rooms.poses import (
 )
 from mover_bench.rooms.render import Sight, box_of_mask, draw_bodies, encode, look_at, see
 from mover_bench.rooms.resting import table_stand
-from mover_bench.rooms.truth import GAPE, NONE, Nearness, nearness
+from mover_bench.rooms.truth import GAPE, NONE, nearness
 
 
 @contextmanager
@@ -117,11 +117,8 @@ def build(
     starts = np.cumsum([0, *(len(act.labels) for act in acts)])
     index = torch.tensor([int(starts[k]) + f for f, k in rows])
     model, pose = open_body(), in_camera(plan, actors, index)
-
-    def near() -> list[Nearness]:
-        return [nearness(model.posed(a.pose)[0].numpy(), plan.pieces) for a in actors]
-
-    nears, (verts, joints) = beside(near, lambda: model.posed(pose))
+    nears = [nearness(model.posed(a.pose)[0].numpy(), plan.pieces) for a in actors]
+    verts, joints = model.posed(pose)
     distance = torch.cat([torch.from_numpy(n.distance).float() for n in nears])[index]
     nearest = torch.cat([torch.from_numpy(n.nearest) for n in nears])[index]
     touching = distance < GAPE

@@ -38,7 +38,6 @@ from mover.geometry.mesh import face_normals, fit_box, used
 from mover.geometry.rle import decode
 from mover.geometry.rotations import rot_y
 from mover.geometry.topology import Triangles, level_set
-from mover.geometry.warp_start import beside
 from mover.stages.camera.find_lens import through_lens
 from mover_bench.rooms import noise_masks as masks
 from mover_bench.rooms.config import NoiseConfig
@@ -351,14 +350,11 @@ def add_noise(room: KnownRoom, noise: NoiseConfig, seed: int) -> Capture:
     if noise.mask_head or noise.mask_box or noise.amodal:
         detections = masks.headed(detections, room.truth, noise, stream(11))
     detections = masks.noisy_detections(detections, noise.object_masks, stream(3))
-    bodies, people = beside(
-        lambda: noisy_bodies(room, noise, stream(4)),
-        lambda: masks.noisy_people(
-            room.capture.people, noise.person_masks, noise.missed_masks, stream(5)
-        ),
-    )
+    shown = room.capture.people
+    people = masks.noisy_people(shown, noise.person_masks, noise.missed_masks, stream(5))
     capture = replace(
-        room.capture, scene=Scene(camera, None, objects), bodies=bodies,
+        room.capture, scene=Scene(camera, None, objects),
+        bodies=noisy_bodies(room, noise, stream(4)),
         people=masks.wobbling(people, noise.wobble, stream(12)),
         detections=masks.leaking(detections, noise.leaks, stream(7)),
         furniture=masks.noisy_people(room.capture.furniture, noise.object_masks, 0.0, stream(14)),

@@ -96,6 +96,11 @@ def run_import(args: ImportArgs) -> None:
     if args.format == "folder" and not args.source.is_dir() and args.source != args.out:
         what = "is a file" if args.source.exists() else "there is no such folder"
         raise InputError(f"{args.source}: {what}, expected a capture")
+    if args.up and args.format not in ("glb", "boxes"):
+        raise InputError(
+            f"--up: is for glb and boxes, not for {args.format}; 'mover check CAPTURE --mend NEW'"
+            " turns what lies on its side"
+        )
     with tempfile.TemporaryDirectory(prefix="mover-import-") as work:  # of meshes on the way
         hints = _hints(args, Path(work))
         main: Parts = read(args.source, hints)

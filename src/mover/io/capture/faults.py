@@ -19,6 +19,7 @@ from mover.core.errors import InputError
 from mover.core.types import Camera, Capture
 from mover.furniture.library import canonical
 from mover.geometry.boxes import iou2d
+from mover.geometry.camera import to_camera
 from mover.geometry.placement import place_object
 from mover.geometry.rle import mask_boxes
 from mover.io.capture import agreement as agree
@@ -168,10 +169,10 @@ def _unexplained(thin: Capture, found: agree.Agreement) -> Iterator[str]:
 
 
 WORLDS = {
-    "on the side (+z is up)": ("x z -y", 1, "+y must be up (import: --up z)"),
+    "on the side (+z is up)": ("x z -y", 1, "+y must be up (import glb, boxes: --up z)"),
     "on the side (+z is down)": ("x -z y", 1, "+y must be up"),
     "that of ROS (x is forward, +z is up)": ("-y z -x", 1, "+y must be up, -z forward"),
-    "upside down (+y is down)": ("x -y -z", -1, "+y must be up (import: --up=-y)"),
+    "upside down (+y is down)": ("x -y -z", -1, "+y must be up (import glb, boxes: --up=-y)"),
     "upside down (only y is turned)": ("x -y z", 1, "change the sign of y"),
     "behind the camera (+z is forward)": ("x y -z", -1, "the camera looks along -z"),
     "turned round (+z is forward)": ("-x y -z", 1, "the camera looks along -z"),
@@ -237,21 +238,33 @@ def _worlds() -> Iterator[Fault]:
 
 
 def _alone(capture: Capture, found: agree.Agreement) -> Iterator[Fault]:
-    """One object that is nearly nowhere to be seen: its mesh on the side, or placed twice."""
-    known, _ = agree.annotated(capture)
-    if len(known) < 2 or len(known) != len(found.objects):
+    """One object that is nearly nowhere to be seen, by its mesh or size, and one inverted mask."""
+    known, boxes = agree.annotated(capture)
+    names = {one.annotation: one.id for one in known}
+    for d in capture.detections if len(capture.detections) > 1 else ():
+        if d.mask is not None and not bool(agree.bounded([d.mask])[0]):
+            name = f"objects.json: the mask of {names.get(d.id, f'annotation {d.id}')} is inverted"
+            mend = partial(mends.inverted_objects, only=d.id)
+            yield Fault(name, "invert it", mend, ALONE / len(capture.detections))
+    if len(known) < 2 or len(known) != len(found.objects) or float(found.objects.min()) > 1 - ALONE:
         return
-    one, margin = known[int(found.objects.argmin())], ALONE / len(known)
+    at, camera = int(found.objects.argmin()), capture.scene.camera
+    one, margin = known[at], ALONE / len(known)
     name, (rows, *_) = next(iter(WORLDS.items()))
-    for what, cure, change in (
-        (
-            f"the mesh of {one.id} is {name}",
-            "turn it: +y must be up",
-            partial(mends.remeshed, mends.axes(rows)),
-        ),
-        (f"the mesh of {one.id} is placed twice", TWICE, lambda x: mends.baked(x.mesh.verts, x)),
-    ):
-        own = partial(mends.each, lambda x, change=change: change(x) if x.id == one.id else x)
+    factors = SCALES.square().tolist()
+    ours = agree.outlines([mends.scaled(k, 1)(one) for k in factors], camera)
+    k = factors[int(iou2d(agree.in_image(ours, camera), boxes[at].expand_as(ours)).argmax())]
+    size = f"{1 / k:.2g} times too large" if k < 1 else f"{k:.2g} times too small"
+    twice = mends.baked(one.mesh.verts, one)
+    changes = [
+        (f"the mesh of {one.id} is {name}", "turn it: +y must be up",
+         mends.remeshed(mends.axes(rows), one)),
+        (f"{one.id} is {size}", f"multiply its 'scale' by {k:.2g}", mends.scaled(k, 1)(one)),
+    ]  # fmt: skip
+    if bool((to_camera(place_object(twice).verts, camera.R_cam_world)[:, 2] > 0).all()):
+        changes.append((f"the mesh of {one.id} is placed twice", TWICE, twice))
+    for what, cure, other in changes:
+        own = partial(mends.each, lambda x, other=other: other if x.id == one.id else x)
         yield Fault(f"scene.json: {what}", cure, own, margin)
 
 
@@ -264,7 +277,7 @@ def _times(capture: Capture, found: agree.Agreement) -> Iterator[Fault]:
     if bodies is None or people is None or not len(people.frame):
         return
     ends = int(bodies.frame.min() + bodies.frame.max())
-    changes: dict[str, tuple[float, int]] = {"the frames run backwards": (-1, ends)}
+    changes: dict[str, tuple[float, int]] = {"": (1, 0), "the frames run backwards": (-1, ends)}
     for n in range(1, MOST_SHIFT + 1):
         count = f"{n} frames" if n > 1 else "1 frame"
         changes |= {
@@ -284,15 +297,24 @@ def _times(capture: Capture, found: agree.Agreement) -> Iterator[Fault]:
     rows = agree.partners(frames, bodies.person.expand_as(frames), people)
     masks = mask_boxes(people.masks)[rows]
     fits = iou2d(agree.in_image(found.boxes, capture.scene.camera).expand_as(masks), masks)
-    shared = (rows >= 0).sum(1)
-    fits = fits.where(rows >= 0, torch.zeros(())).sum(1) / shared.clamp_min(1)
-    fits[shared < max(FEWEST, int(shared.max()) / 2)] = -1
-    if float(fits.max()) < FITTED_TIME:
-        return
-    fits = fits * (shared / shared.max()).sqrt().sqrt()  # few rows fit by chance
-    name = list(changes)[int(fits.argmax())]
-    cure = "number the frames of bodies and masks as those of one video (--fps), from 0"
-    yield Fault(f"bodies.npz: {name}", cure, partial(mends.retimed, *changes[name]), TIME_MARGIN)
+    best, change, late = 0.0, "", None
+    for who in (None, *bodies.person.unique().tolist()):  # all, then one alone
+        mine = torch.ones_like(rows[0]).bool() if who is None else bodies.person == who
+        both = (rows >= 0).where(mine, rows[0] >= 0)
+        shared, total = both.sum(1), (both * fits.where(mine, fits[0])).sum(1)
+        score = total / shared.clamp_min(1)
+        score[shared < max(FEWEST, int(shared.max()) / 2)] = -1
+        if float(score.max()) < FITTED_TIME:
+            continue
+        score = score * (shared / rows.shape[1]).sqrt().sqrt()  # few rows fit by chance
+        if float(score.max()) > best + SAME:
+            best, change, late = float(score.max()), list(changes)[int(score.argmax())], who
+    if change:
+        name = change if late is None else change.replace("bodies", f"bodies of track {late}")
+        cure = "number the frames of bodies and masks as those of one video (--fps), from 0"
+        mend = partial(mends.retimed, *changes[change], late)
+        unseen = late is not None and not bool((rows[0] >= 0)[bodies.person == late].any())
+        yield Fault(f"bodies.npz: {name}", cure, mend, -SAME if unseen else TIME_MARGIN)
 
 
 def _swaps(capture: Capture, found: agree.Agreement) -> Iterator[Fault]:

@@ -111,11 +111,13 @@ def frames(frame: Int[Tensor, " rows"], rate: float, shift: int) -> Int[Tensor, 
     return (frame * rate).round().long() + shift
 
 
-def retimed(rate: float, shift: int, capture: Capture) -> Capture:
-    """Bodies in other frames."""
-    assert capture.bodies is not None
-    new = frames(capture.bodies.frame, rate, shift)
-    return replace(capture, bodies=replace(capture.bodies, frame=new))
+def retimed(rate: float, shift: int, track: int | None, capture: Capture) -> Capture:
+    """Bodies in other frames, of one track or of all."""
+    bodies = capture.bodies
+    assert bodies is not None
+    new = frames(bodies.frame, rate, shift)
+    new = new if track is None else new.where(bodies.person == track, bodies.frame)
+    return replace(capture, bodies=replace(bodies, frame=new))
 
 
 def inverted_people(capture: Capture) -> Capture:
@@ -124,12 +126,14 @@ def inverted_people(capture: Capture) -> Capture:
     return replace(capture, people=replace(seen, masks=_inverted(seen.masks))) if seen else capture
 
 
-def inverted_objects(capture: Capture) -> Capture:
-    """The background of the furniture's masks, and its boxes."""
+def inverted_objects(capture: Capture, only: int | None = None) -> Capture:
+    """The background of the furniture's masks, and its boxes; of one annotation or of all."""
 
     def other(one: Detection) -> Detection:
-        mask = None if one.mask is None else _inverted(one.mask)
-        if mask is None or not area(mask, 0):
+        if one.mask is None or only not in (None, one.id):
+            return one
+        mask = _inverted(one.mask)
+        if not area(mask, 0):
             return one
         return replace(one, mask=mask, box=mask_boxes(mask)[0].to(one.box))
 

@@ -20,10 +20,11 @@ from mover.io.files.fields import Warn, listed
 LARGEST, SMALLEST = 30.0, 0.01  # [m], longest side of an object
 FARTHEST = 100.0  # [m] from the camera
 FAR = 30.0  # [m], odd for a room
+ROOM = 4.0  # [m], usual
 TURNS = 4 * math.pi  # [rad], a yaw beyond is odd: degrees?
 MOST_TURNS = 1e3  # [rad], a yaw beyond has lost its digits
 OFF = 8.0  # factor between the size of an object and what its box implies, from which it is odd
-NEAREST = 0.05  # [m] before the camera, from where on a box implies a size
+NEAREST = 0.05  # [m] from the camera, from where on a box implies a size
 SHORTEST, LONGEST = 0.05, 10.0  # [m] across, of the usual body
 USUAL = 1.8  # [m] across, of a body
 NEAR_BODY = 0.3  # [m] from the camera to the middle of the usual body
@@ -87,7 +88,10 @@ def _check_place(
     away, yaw = float(one.t_world_object.norm()), float(one.yaw)
     place, angle = name.format("translation"), name.format("yaw")
     if not away <= FARTHEST:
-        raise InputError(f"{place} is {away:.3g} m away, expected at most {FARTHEST:g} m")
+        unit = min(UNITS, key=lambda name: abs(math.log(away / (ROOM * UNITS[name]))))
+        raise InputError(
+            f"{place} is {away:.3g} m away, expected at most {FARTHEST:g} m; is it in {unit}?"
+        )
     if not abs(yaw) <= MOST_TURNS:
         raise InputError(f"{angle} has {yaw:.3g} rad, expected {-MOST_TURNS:g} to {MOST_TURNS:g}")
     if abs(yaw) > TURNS:
@@ -104,10 +108,10 @@ def _check_size(
 ) -> None:
     """Objects have the size of furniture, and nearly that which box and distance imply."""
     size, ratio, advice = float(box_of(one).size.max()), 1.0, ""
-    depth = float(to_camera(one.t_world_object[None], camera.R_cam_world)[0, 2])
-    if detection is not None and depth > NEAREST:
+    away = float(one.t_world_object.norm())  # whatever axes it has
+    if detection is not None and away > NEAREST:
         wide, high = (detection.box[2:] - detection.box[:2]) / camera.K.diagonal()[:2]
-        implied = max(float(wide), float(high)) * depth
+        implied = max(float(wide), float(high)) * away
         ratio = size / implied
         advice = f", as its box at its distance implies about {implied:.2g}"
     is_odd = not 1 / OFF < ratio < OFF
