@@ -16,8 +16,7 @@ import torch
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from mover.app.pictures.film import pixels
-from mover.app.pictures.overlay import backdrop
-from mover.app.pictures.paint import Surfaces, draw_picture, furniture, joined, people
+from mover.app.pictures.overlay import Surfaces, backdrop, draw_picture, furniture, joined, people
 from mover.bodies.skinning import open_body
 from mover.core.types import Bodies, Camera, Scene, SceneObject
 from mover.furniture.library import STYLES, make_piece

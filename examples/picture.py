@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from mover.app.pictures.paint import draw_picture, furniture, joined, people
+from mover.app.pictures.overlay import draw_picture, furniture, joined, people
 from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.scene_file import read_scene
 from mover.io.formats import read

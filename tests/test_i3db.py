@@ -13,15 +13,7 @@ from mover.geometry.boxes import box_of
 from mover.geometry.camera import pitch_roll, tilted
 from mover_bench.cli import ExperimentArgs
 from mover_bench.datasets.i3db import HALPE, JOINTS, read_i3db
-from mover_bench.experiment.real import (
-    clips_table,
-    i3db_table,
-    judge_clips,
-    judge_i3db,
-    overlaps,
-    tops_below,
-    wrongly_placed,
-)
+from mover_bench.experiment import real
 
 REAL = Path(__file__).parents[2] / "shared" / "data" / "i3db"
 PITCH, FLOOR = math.radians(-5.0), -1.2
@@ -70,7 +62,7 @@ def test_parts_become_objects_that_stand_in_a_level_world(tmp_path: Path) -> Non
     assert box_of(couch).size.tolist() == pytest.approx([1.8, 0.75, 0.8], abs=1e-4)
     assert box_of(table).size[1] == pytest.approx(0.64, abs=1e-4)  # legs down to that floor
     assert [d.id for d in scene.detections] == [1, 2]
-    assert overlaps("imapper", [couch, table], scene)["imapper"] == pytest.approx(1)
+    assert real.overlaps("imapper", [couch, table], scene)["imapper"] == pytest.approx(1)
 
 
 def test_keypoints_are_those_of_even_frames_in_pixels_of_the_video(tmp_path: Path) -> None:
@@ -86,10 +78,10 @@ def test_keypoints_are_those_of_even_frames_in_pixels_of_the_video(tmp_path: Pat
 
 def test_wrong_places_are_the_same_each_time_and_off(tmp_path: Path) -> None:
     scene = read_i3db(write_scene(tmp_path / "Scene1"))
-    wrong = [wrongly_placed(scene, scene.truth.camera) for _ in range(2)]
+    wrong = [real.wrongly_placed(scene, scene.truth.camera) for _ in range(2)]
     for a, b in zip(wrong[0].objects, wrong[1].objects, strict=True):
         assert torch.equal(a.t_world_object, b.t_world_object)
-    assert overlaps("given", wrong[0].objects, scene)["given"] < 0.9
+    assert real.overlaps("given", wrong[0].objects, scene)["given"] < 0.9
 
 
 @pytest.mark.parametrize(("change", "words"), [
@@ -101,14 +93,16 @@ def test_what_is_no_i3db_is_a_sentence(change, words, tmp_path, monkeypatch) -> 
     monkeypatch.chdir(tmp_path)
     given = {k: Path(v) if k == "source" else v for k, v in change.items()}
     with pytest.raises(InputError, match=words):
-        judge_i3db(ExperimentArgs(set="i3db", out=tmp_path, **given))
+        real.judge_i3db(ExperimentArgs(set="i3db", out=tmp_path, **given))
     with pytest.raises(InputError, match="has no gt/skel_"):
         read_i3db(tmp_path)
 
 
 def test_a_table_has_a_row_a_scene_and_the_means() -> None:
     keys = ("first", "run", "given", "run_given", "imapper", "run_pitch", "run_height", "stature")
-    lines = i3db_table({"a": dict.fromkeys(keys, 0.2), "b": dict.fromkeys(keys, 0.4)}).splitlines()
+    lines = real.i3db_table(
+        {"a": dict.fromkeys(keys, 0.2), "b": dict.fromkeys(keys, 0.4)}
+    ).splitlines()
     assert len(lines) == 5
     assert lines[-1].startswith("| mean | 0.300 |")
 
@@ -133,15 +127,15 @@ def test_the_surface_under_a_point_is_the_highest_one_below_it():
     faces = torch.cat([x[torch.tensor([[0, 1, 2], [0, 2, 3]])] for x in (floor, seat, slope)])
     points = torch.tensor([[0.5, 0.6, 0.5], [0.5, 0.4, 0.4], [0.5, 0.3, 0.4], [2.5, 0.9, 0.5]])
     above = torch.tensor([[9.0, 1.0, 9.0]])
-    found = tops_below(torch.cat([points, above]), faces)
+    found = real.tops_below(torch.cat([points, above]), faces)
     assert found.tolist() == pytest.approx([0.5, 0.5, -1, 0.1, -torch.inf], abs=1e-6)
 
 
 def test_a_folder_without_clips_is_refused_and_a_table_has_a_row_for_each_object(tmp_path: Path):
     for source in (None, tmp_path):
         with pytest.raises(InputError, match="--source: expected a folder of clips"):
-            judge_clips(ExperimentArgs(set="clips", source=source))
+            real.judge_clips(ExperimentArgs(set="clips", source=source))
     rows = [{"object": "bed_0", "size": "1.00 x 0.50 x 2.00", "iou": 0.7}, {"object": "chair_0"}]
-    table = clips_table({"a": {"stature": 1.7, "objects": rows}})
+    table = real.clips_table({"a": {"stature": 1.7, "objects": rows}})
     assert table.count("\n| a | 1.7 |") == 2
     assert "| bed_0 | 1.00 x 0.50 x 2.00 |" in table

@@ -11,15 +11,8 @@ from PIL import Image
 from test_export import textured as textured_box
 
 from mover.core.errors import InputError
+from mover.io.files import meshes
 from mover.io.files.fields import At
-from mover.io.files.meshes import (
-    companions,
-    copy_mesh,
-    is_cloud,
-    load_arrays,
-    load_parts,
-    looks_lost,
-)
 
 RED = (200, 10, 10)
 OBJ = """{library}
@@ -56,7 +49,7 @@ def textured(folder: Path, line: str, file: str | None, library: str = "mtllib a
 
 
 def parts_of(path: Path) -> Any:
-    return load_parts(At(path.name, "here"), path)
+    return meshes.load_parts(At(path.name, "here"), path)
 
 
 def colour_of(path: Path) -> Any:
@@ -69,9 +62,9 @@ def colour_of(path: Path) -> Any:
 def test_a_texture_is_found_as_people_name_it_and_goes_along(way, tmp_path):
     path = textured(tmp_path / "in", *NAMED[way])
     assert colour_of(path) == RED
-    assert looks_lost(path) == ""
-    assert companions(path) == (Path("a.mtl"), Path(NAMED[way][1]))
-    assert colour_of(copy_mesh(path, tmp_path / "out", "chair_0")) == RED
+    assert meshes.looks_lost(path) == ""
+    assert meshes.companions(path) == (Path("a.mtl"), Path(NAMED[way][1]))
+    assert colour_of(meshes.copy_mesh(path, tmp_path / "out", "chair_0")) == RED
 
 
 @pytest.mark.parametrize(("line", "library", "said"), [
@@ -81,7 +74,7 @@ def test_a_texture_is_found_as_people_name_it_and_goes_along(way, tmp_path):
 ])  # fmt: skip
 def test_what_is_lost_of_the_looks_is_said(line, library, said, tmp_path):
     path = textured(tmp_path, line, "wood.png", library)
-    assert said in looks_lost(path)
+    assert said in meshes.looks_lost(path)
     assert len(parts_of(path).to_mesh().faces) == 2
 
 
@@ -97,9 +90,9 @@ def test_pictures_of_a_gltf_are_found_in_any_case(tmp_path):
     path.write_text(json.dumps(tree))
     (loaded,) = parts_of(path).geometry.values()
     assert loaded.visual.material.baseColorTexture.getpixel((0, 0)) == RED
-    assert Path("Wood.png") in companions(path)
+    assert Path("Wood.png") in meshes.companions(path)
     (tmp_path / "Wood.png").unlink()
-    assert "loses the texture textures\\wood.PNG" in looks_lost(path)
+    assert "loses the texture textures\\wood.PNG" in meshes.looks_lost(path)
 
 
 def test_groups_materials_and_indices_from_the_end_are_one_mesh(tmp_path):
@@ -108,10 +101,10 @@ def test_groups_materials_and_indices_from_the_end_are_one_mesh(tmp_path):
     text = "mtllib many.mtl\n# M\xf6bel\n" + "".join(part.format(i=i) for i in range(3000))
     path.write_bytes(text.encode("latin-1"))
     (tmp_path / "many.mtl").write_text("".join(f"newmtl m{i}\nKd 1 0 0\n" for i in range(3000)))
-    verts, faces = load_arrays(At(path.name, "here"), path)
+    verts, faces = meshes.load_arrays(At(path.name, "here"), path)
     assert verts[faces].tolist() == [[[i, 0, 0], [i, 1, 0], [i, 0, 1]] for i in range(3000)]
     assert len(parts_of(path).to_mesh().faces) == 3000
-    assert "3000 materials" in looks_lost(path)
+    assert "3000 materials" in meshes.looks_lost(path)
 
 
 REMARKS = {  # how the file is written, and what becomes of its first mark
@@ -127,7 +120,7 @@ def test_a_byte_that_is_not_utf_8_does_not_matter(kind, tmp_path):
     whole: Any = trimesh.creation.box().export(**options)
     content = whole.encode() if isinstance(whole, str) else whole
     path.write_bytes(content.replace(mark, word, 1))
-    assert len(load_arrays(At(path.name, "here"), path)[1]) == 12
+    assert len(meshes.load_arrays(At(path.name, "here"), path)[1]) == 12
 
 
 # What has no surface, or is not what its name says.
@@ -156,10 +149,10 @@ def test_what_is_no_mesh_is_named_for_what_it_is(name, tmp_path):
     text = "utf-16-le" if name == "wide.obj" else "utf-8"
     (tmp_path / name).write_text(content, text)
     with pytest.raises(InputError, match=words) as caught:
-        load_arrays(At(name, "scene.json", "objects[0].mesh"), tmp_path / name)
+        meshes.load_arrays(At(name, "scene.json", "objects[0].mesh"), tmp_path / name)
     assert str(caught.value).startswith("scene.json: field 'objects[0].mesh' has ")
     assert "Error" not in str(caught.value)
-    assert is_cloud(tmp_path / name) == (name == "splats.ply")
+    assert meshes.is_cloud(tmp_path / name) == (name == "splats.ply")
 
 
 def gltf(path: Path, nodes: list[Any], count: int = 60_000, **more: Any) -> Path:
@@ -184,4 +177,4 @@ def gltf(path: Path, nodes: list[Any], count: int = 60_000, **more: Any) -> Path
 def test_files_that_unfold_or_are_packed_are_refused_at_once(nodes, more, words, tmp_path):
     path = gltf(tmp_path / "a.glb", nodes, **more)
     with pytest.raises(InputError, match=words):
-        load_arrays(At(path.name, "here"), path)
+        meshes.load_arrays(At(path.name, "here"), path)

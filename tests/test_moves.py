@@ -16,13 +16,7 @@ from mover.core.errors import InputError
 from mover.core.records import rows_of
 from mover.core.types import Bodies, Masks, People, Scene, SceneObject, Segment
 from mover.evaluate.bodies import StandingMesh, nearness
-from mover.extensions.moved_furniture.stays import (
-    Between,
-    Followed,
-    MoveInputs,
-    find_moves,
-    follow_mover,
-)
+from mover.extensions.moved_furniture import stays as movers
 from mover.geometry.placement import changes, mover_at, placed_at, standing_meshes
 from mover.geometry.rle import decode, encode
 from mover.geometry.rotations import rot_y, wrap
@@ -51,7 +45,7 @@ def rows(seen: list[tuple[int, int, torch.Tensor]]) -> People:
 
 def stays(seen: list[tuple[int, int, torch.Tensor]], people: People | None = None):
     numbers = tuple(sorted({number for _, number, _ in seen}))
-    found = find_moves(MoveInputs(rows(seen), people, numbers, FPS)).stays
+    found = movers.find_moves(movers.MoveInputs(rows(seen), people, numbers, FPS)).stays
     return [(stay.annotation, stay.first) for stay in found]
 
 
@@ -74,14 +68,14 @@ def test_a_stay_lasts_only_while_it_is_seen_and_not_while_it_may_be_hidden():
     seen = [(f, 3, patch(20, 30) if f < 20 else patch(90, 40)) for f in FRAMES]
     seen = [(f, n, m & ~body if 14 < f < 30 else m) for f, n, m in seen]
     people = rows([(f, 0, body) for f in FRAMES if 14 < f < 30])
-    found = find_moves(MoveInputs(rows(seen), people, (3,), FPS)).stays
+    found = movers.find_moves(movers.MoveInputs(rows(seen), people, (3,), FPS)).stays
     assert [stay.sure for stay in found] == [(0, 14), (30, 58)]
 
 
 def test_an_object_that_stands_elsewhere_from_a_frame_on_has_two_stays():
     seen = [(f, 3, patch(20, 30) if f < 30 else patch(90, 40)) for f in FRAMES]
     assert stays(seen) == [(3, 0), (3, 29)]
-    found = find_moves(MoveInputs(rows(seen), None, (3,), FPS)).stays
+    found = movers.find_moves(movers.MoveInputs(rows(seen), None, (3,), FPS)).stays
     assert torch.equal(found[1].mask, patch(90, 40)[1::3, 1::3])
 
 
@@ -290,11 +284,11 @@ def carried(way: torch.Tensor, off: tuple[float, float]) -> list[SceneObject]:
     return places
 
 
-def followed(places: list[SceneObject], bodies: Bodies) -> Followed | None:
+def followed(places: list[SceneObject], bodies: Bodies) -> movers.Followed | None:
     unknown = torch.full((bodies.verts.shape[1],), -1)
     parts = BodyParts(unknown, torch.zeros(0, 1, dtype=torch.long))
-    between = Between(places[0], places[-1], BEGIN + 2, END - 2)
-    return follow_mover(between, bodies, parts, GROUND)
+    between = movers.Between(places[0], places[-1], BEGIN + 2, END - 2)
+    return movers.follow_mover(between, bodies, parts, GROUND)
 
 
 @pytest.mark.parametrize(("name", "off", "hold"), [

@@ -11,7 +11,7 @@ from PIL import Image
 from tiny_capture import HEIGHT, WIDTH, write_capture
 
 from mover.app.cli import run_command
-from mover.app.pictures import RenderConfig, paint
+from mover.app.pictures import RenderConfig, overlay
 from mover.app.pictures.film import save_film, video_pictures
 from mover.app.pictures.overlay import backdrop, render_result, render_room
 from mover.core.errors import InputError
@@ -29,7 +29,7 @@ def pixels_of(points_world, camera):
 
 def test_an_object_is_drawn_on_the_pixels_of_its_mask(small_room):
     camera = small_room.truth.camera
-    owner = paint.draw(paint.furniture(small_room.truth), camera).owner
+    owner = overlay.draw(overlay.furniture(small_room.truth), camera).owner
     masks = see(small_room.plan).piece
     assert owner.shape == masks.shape
     for index in range(len(small_room.truth.objects)):
@@ -43,8 +43,10 @@ def test_a_person_is_drawn_on_the_pixels_of_the_visible_mask(small_room):
     bodies = dataclasses.replace(given, verts=world, joints=None, joint_names=(), space="world")
     masks = small_room.capture.people.masks
     for row in (0, len(world) // 2, len(world) - 1):
-        surfaces = paint.joined([paint.furniture(small_room.truth), paint.people(bodies, [row])])
-        mine = paint.draw(surfaces, camera).owner >= paint.PERSON
+        surfaces = overlay.joined(
+            [overlay.furniture(small_room.truth), overlay.people(bodies, [row])]
+        )
+        mine = overlay.draw(surfaces, camera).owner >= overlay.PERSON
         mask = torch.from_numpy(thinned(masks, row, 1))
         assert (mine & mask).sum() >= 0.98 * (mine | mask).sum()
 
@@ -53,14 +55,14 @@ def test_pictures_of_any_size_show_the_same_points():
     camera = room().camera
     points = torch.tensor([[0.4, -0.8, -3.5], [-1.0, -1.5, -4.0]])
     for width in (640, 320, 1280):
-        small = paint.sized_camera(camera, width, width * 9 // 16)
+        small = overlay.sized_camera(camera, width, width * 9 // 16)
         truth = pixels_of(points, camera) * width / 640
         assert torch.allclose(pixels_of(points, small), truth, atol=1e-3)
 
 
 def test_rays_to_the_floor_project_back_to_their_pixels():
-    camera = paint.sized_camera(room().camera, 64, 36)
-    floor = paint.floor_points(camera, GROUND)
+    camera = overlay.sized_camera(room().camera, 64, 36)
+    floor = overlay.floor_points(camera, GROUND)
     seen = floor.isfinite().all(-1)
     rows, columns = torch.nonzero(seen, as_tuple=True)
     centre = torch.stack([columns, rows], -1) + 0.5
@@ -150,8 +152,8 @@ def test_moved_furniture_is_drawn_where_it_stands_in_the_frame():
     world = dataclasses.replace(scene, objects=(moved, *others))
     found = list(render_room(world, None, [4, 5, 4], 64))
     for picture, item in zip(found, (chair, there, chair), strict=True):
-        alone = paint.furniture(dataclasses.replace(scene, objects=(item, *others)))
-        expected, _ = paint.draw_picture(alone, scene.camera, backdrop(36, 64), GROUND)
+        alone = overlay.furniture(dataclasses.replace(scene, objects=(item, *others)))
+        expected, _ = overlay.draw_picture(alone, scene.camera, backdrop(36, 64), GROUND)
         assert torch.equal(picture, expected)
     assert (found[0] - found[1]).abs().max() > 0.2
 

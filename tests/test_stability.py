@@ -25,15 +25,8 @@ from mover.geometry.placement import place_object, placed_at
 from mover.geometry.topology import is_closed
 from mover.geometry.watertight import close_mesh
 from mover.io.capture.scene_file import write_scene
+from mover.io.export import solids
 from mover.io.export.finished import read_finished
-from mover.io.export.solids import (
-    DENSITY,
-    ConvexConfig,
-    ConvexInputs,
-    cut_into_convex,
-    export_mjcf,
-    solids_of,
-)
 from mover.io.files.meshes import write_mesh
 
 BOXES = ("chair", "table")
@@ -60,7 +53,7 @@ def test_convex_pieces_fill_the_furniture_and_little_more(name: str, method: str
     if method == "coacd":
         pytest.importorskip("coacd", reason="needs the extra physics")
     mesh = close_mesh(make_piece(name, np.random.default_rng(0), 0).mesh)
-    found = cut_into_convex(ConvexInputs(mesh), ConvexConfig(method))
+    found = solids.cut_into_convex(solids.ConvexInputs(mesh), solids.ConvexConfig(method))
     union = manifold(found.hulls[0])
     for hull in found.hulls:
         assert is_closed(hull.faces)
@@ -75,18 +68,20 @@ def test_convex_pieces_fill_the_furniture_and_little_more(name: str, method: str
 
 
 def test_a_convex_piece_stays_whole_and_a_sheet_gets_some_thickness():
-    whole = cut_into_convex(ConvexInputs(box(1, 2, 3)), ConvexConfig("slices"))
+    whole = solids.cut_into_convex(solids.ConvexInputs(box(1, 2, 3)), solids.ConvexConfig("slices"))
     assert len(whole.hulls) == 1
     assert whole.volume == pytest.approx(6)
-    thin = cut_into_convex(ConvexInputs(box(1, 1e-7, 1)), ConvexConfig("slices"))
+    thin = solids.cut_into_convex(
+        solids.ConvexInputs(box(1, 1e-7, 1)), solids.ConvexConfig("slices")
+    )
     assert float(np.ptp(thin.hulls[0].verts[:, 1].numpy())) > 5e-4
 
 
 def test_convex_pieces_are_kept_with_the_result(tmp_path: Path):
     scene = furnished(BOXES)
-    first = solids_of(scene, Run(tmp_path))
+    first = solids.solids_of(scene, Run(tmp_path))
     again = Run(tmp_path)
-    second = solids_of(scene, again)
+    second = solids.solids_of(scene, again)
     assert [log.kept for log in again.stages] == [True, True]
     for a, b in zip(first, second, strict=True):
         assert torch.equal(
@@ -97,28 +92,28 @@ def test_convex_pieces_are_kept_with_the_result(tmp_path: Path):
 def test_the_closed_proxies_of_the_run_are_what_collides(tmp_path: Path):
     scene = furnished(("chair",))
     write_mesh(box(0.3, 0.4, 0.5), tmp_path / "watertight" / "chair_0.glb")
-    solid = solids_of(scene, Run(tmp_path))[0]
+    solid = solids.solids_of(scene, Run(tmp_path))[0]
     assert len(solid.hulls) == 1
-    assert solid.mass == pytest.approx(0.3 * 0.4 * 0.5 * DENSITY["chair"], rel=1e-5)
+    assert solid.mass == pytest.approx(0.3 * 0.4 * 0.5 * solids.DENSITY["chair"], rel=1e-5)
 
 
 def test_mass_and_inertia_are_those_of_the_stretched_solid(tmp_path: Path):
     """Against trimesh, on the mesh in the simulator's axes."""
     given = furnished(("chair",)).objects[0]
     given = dataclasses.replace(given, scale=torch.tensor([1.3, 0.8, 1.1]))
-    solid = solids_of(Scene(camera(), GROUND, (given,)), Run(tmp_path))[0]
+    solid = solids.solids_of(Scene(camera(), GROUND, (given,)), Run(tmp_path))[0]
     x, y, z = (close_mesh(given.mesh).verts * given.scale).double().numpy().T
     truth = trimesh.Trimesh(
         np.stack([x, -z, y], -1), close_mesh(given.mesh).faces.numpy(), process=False
     )
-    truth.density = DENSITY["chair"]
+    truth.density = solids.DENSITY["chair"]
     assert solid.mass == pytest.approx(truth.mass, rel=1e-4)
     assert solid.centre.numpy() == pytest.approx(truth.center_mass, abs=1e-5)
     assert solid.inertia.numpy() == pytest.approx(truth.moment_inertia, rel=1e-3, abs=1e-4)
 
 
 def test_every_class_of_the_library_has_a_density():
-    assert {canonical(name) for name in PIECES} <= set(DENSITY)
+    assert {canonical(name) for name in PIECES} <= set(solids.DENSITY)
 
 
 @needs_mujoco
@@ -130,7 +125,7 @@ def test_mujoco_reads_the_model_with_everything_in_place(tmp_path: Path):
     ]
     scene = dataclasses.replace(scene, objects=tuple(pieces))
     home = read_finished(write_out(tmp_path / "out", scene))
-    mujoco, model, data = simulated(export_mjcf(home, tmp_path).files[0])
+    mujoco, model, data = simulated(solids.export_mjcf(home, tmp_path).files[0])
     mujoco.mj_forward(model, data)
     assert model.njnt == 2  # the table hangs
     for given in pieces:
@@ -180,8 +175,10 @@ def test_masses_are_said_with_two_digits_however_light(tmp_path):
         piece = dataclasses.replace(scene.objects[0], scale=torch.full((3,), size))
         scene = dataclasses.replace(scene, objects=(piece,))
         home = read_finished(write_out(tmp_path / "out", scene))
-        (said,) = (note for note in export_mjcf(home, tmp_path).notes if note.endswith(" kg"))
-        mass = solids_of(scene, Run(tmp_path / "out"))[0].mass
+        (said,) = (
+            note for note in solids.export_mjcf(home, tmp_path).notes if note.endswith(" kg")
+        )
+        mass = solids.solids_of(scene, Run(tmp_path / "out"))[0].mass
         assert float(said.split()[1]) == pytest.approx(mass, rel=0.05)
         assert "e" not in said.split()[1]
 
@@ -191,7 +188,7 @@ def test_keyframes_put_furniture_where_it_then_stands(tmp_path: Path):
     home = read_finished(write_out(tmp_path / "out", furnished(BOXES)))
     objects = moved(home.scene, 8).objects[::-1]
     scene = dataclasses.replace(home.scene, objects=objects)
-    file = export_mjcf(dataclasses.replace(home, scene=scene), tmp_path).files[0]
+    file = solids.export_mjcf(dataclasses.replace(home, scene=scene), tmp_path).files[0]
     mujoco, model, data = simulated(file)
     assert [model.key(k).name for k in range(model.nkey)] == ["frame_0", "frame_8"]
     for key, frame in enumerate((0, 8)):
