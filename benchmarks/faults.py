@@ -27,6 +27,7 @@ from mover_bench.experiment.job import room_named
 
 Change = Callable[[Capture], Capture | None]
 Z_UP = rot_x(torch.tensor(math.pi / 2))  # (x, y, z) of a y-up world in a z-up one: (x, -z, y)
+X_UP = rot_z(torch.tensor(-math.pi / 2))
 ROS = torch.tensor([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]])  # x forward, y left, z up
 HALF_TURN = rot_z(torch.tensor(math.pi))
 
@@ -213,6 +214,7 @@ FAULTS: dict[str, tuple[str, Change]] = {
     "one object 5 times too large": ("times too large", mesh(
         lambda one: 5 * one.mesh.verts, first=True)),
     "meshes with +z up": ("side (+z is up)", mesh(lambda one: one.mesh.verts @ Z_UP.mT)),
+    "meshes with +x up": ("side (+x is up)", mesh(lambda one: one.mesh.verts @ X_UP.mT)),
     "one mesh with +z up": ("is on the side", mesh(
         lambda one: one.mesh.verts @ Z_UP.mT, first=True)),
     "one placement applied twice": ("placed twice", mesh(

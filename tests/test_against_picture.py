@@ -22,6 +22,7 @@ from mover.io.capture.agreement import (
 )
 from mover.io.capture.faults import check_against_picture, write_mended
 from mover.io.capture.folder import read_capture, write_capture
+from mover.io.capture.plausible import check_bodies
 
 FAULTS = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "faults.py"))["FAULTS"]
 
@@ -147,3 +148,11 @@ def test_no_cure_is_named_that_leads_to_where_nothing_is_seen(right):
     found = check_against_picture(replace(right, scene=replace(right.scene, objects=some)))
     assert not found.faults
     assert any("are scene, camera and picture of one room" in text for text in found.unexplained)
+
+
+def test_a_frame_rate_with_which_people_are_too_fast_for_a_room_is_asked_about(right):
+    said, bodies = [], replace(right.bodies, frame=right.bodies.frame // 3, fps=5.0)
+    check_bodies(bodies, "bodies.npz", said.append)
+    check_bodies(replace(bodies, fps=90.0), "bodies.npz", said.append)
+    (one,) = said
+    assert "frame rate 90 right" in one

@@ -116,7 +116,7 @@ JSON = [
     ("camera.json", "cx", 1e8, "'cx' has 1e.08, expected -640 to 640 px"),
     ("scene.json", "ground.height", -80, "has -80, expected a finite number from -30"),
     ("scene.json", "objects.0.translation", [1e9, 0, 0], "translation' of chair_0 is 1e.09 m away"),
-    ("scene.json", "objects.1.translation", [0, 0, -500], r"\[1\].translation.* is 500 m away"),
+    ("scene.json", "objects.1.translation", [0, 0, -500], r"\[1\].*500 m away.*in centimetres"),
     ("scene.json", "objects.0.yaw", 1e8, "yaw' of chair_0 has 1e.08 rad, expected -1000 to 1000"),
     ("scene.json", "objects.0.scale", [1000] * 3, "2e.03 m large, expected .*millimetres"),
     ("scene.json", "objects.0.scale", [50, 100, 60], "100 m large.*centimetres. Multiply .* 0.01"),

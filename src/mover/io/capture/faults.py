@@ -171,6 +171,7 @@ def _unexplained(thin: Capture, found: agree.Agreement) -> Iterator[str]:
 WORLDS = {
     "on the side (+z is up)": ("x z -y", 1, "+y must be up (import glb, boxes: --up z)"),
     "on the side (+z is down)": ("x -z y", 1, "+y must be up"),
+    "on the side (+x is up)": ("-y x z", 1, "+y must be up"),
     "that of ROS (x is forward, +z is up)": ("-y z -x", 1, "+y must be up, -z forward"),
     "upside down (+y is down)": ("x -y -z", -1, "+y must be up (import glb, boxes: --up=-y)"),
     "upside down (only y is turned)": ("x -y z", 1, "change the sign of y"),

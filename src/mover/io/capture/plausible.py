@@ -8,6 +8,8 @@ import math
 from collections import defaultdict
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from mover.core.errors import InputError
 from mover.core.types import Bodies, Camera, Capture, Detection, SceneObject
@@ -34,6 +36,7 @@ OFF_AXIS = 10.0  # sides of the picture from its corner to the axis of the lens
 SQUARE = 1.5  # factor between the focal lengths along both sides, odd from there on
 ASIDE = 0.1  # shares of the picture between its border and the axis of the lens
 STRETCH = 50.0  # factor between the scales of an object along its axes, odd from there on
+WINDOW, FASTEST, FEWEST = 0.2, 5.0, 10  # [s] and [m/s] of people in a room; windows that show it
 JOINTS_OFF = 0.5  # [m] from the box of a mesh to its joints
 UNITS = {"millimetres": 1000.0, "centimetres": 100.0, "inches": 39.37}
 SCENE = "scene.json"
@@ -183,8 +186,28 @@ def check_bodies(bodies: Bodies, file: str, warn: Warn) -> None:
         )
     if odd := int((extent > 2 * TALLEST).sum()):
         warn(f"{file}: {odd} of {len(extent)} bodies measure more than {2 * TALLEST:g} m across")
+    if bodies.fps and (speed := _usual_most(bodies, (low + high) / 2)) > FASTEST:
+        rate = f"is the frame rate {bodies.fps:g} right (--fps)?"
+        warn(f"{file}: people move at {speed:.0f} m/s and more in a tenth of the video; {rate}")
     if bodies.joints is not None:
         below, above = low[:, None] - bodies.joints, bodies.joints - high[:, None]
         off = torch.maximum(below, above).clamp_min(0).norm(dim=-1).amax(-1).median()
         if not float(off) <= JOINTS_OFF:
             warn(f"{file}: field 'joints' is {float(off):.2g} m off the meshes")
+
+
+def _usual_most(bodies: Bodies, middle: Float[Tensor, "bodies 3"]) -> float:
+    """Speed that people exceed in a tenth of the times, over `WINDOW` [m/s]; 0: too few times."""
+    assert bodies.fps is not None
+    wide, found = max(1, round(WINDOW * bodies.fps)), [torch.zeros(0)]
+    for person in bodies.person.unique():
+        rows = (bodies.person == person).nonzero()[:, 0]
+        rows = rows[bodies.frame[rows].argsort()]
+        frame = bodies.frame[rows]
+        later = torch.searchsorted(frame, frame + wide)
+        here = later < len(rows)
+        a, b = rows[here], rows[later[here]]
+        time = (bodies.frame[b] - bodies.frame[a]) / bodies.fps
+        found.append((middle[b] - middle[a]).norm(dim=-1).cpu() / time.cpu())
+    speeds = torch.cat(found)
+    return float(speeds.quantile(0.9)) if len(speeds) >= FEWEST else 0.0
