@@ -114,7 +114,7 @@ def test_run_has_few_flags_and_the_first_screen_shows_those_that_people_use(caps
     (["run", "nowhere"], "nowhere"),
     (["fit", "x", "--preset", "best"], "robust, paper"),
     (["import-bodies", "nope", "x"], "TOOL: 'nope' is none of"),
-    (["import", "masks", ".", "--out", "x", "--up", "z"], "--up: is for glb and boxes, not for mas"),
+    (["import", "masks", ".", "--out", "x", "--up", "z"], "--up: is for glb and boxes, not for"),
 ])  # fmt: skip
 def test_a_wrong_name_is_answered_with_the_known_ones(words, said, capsys):
     assert cli.run_command(words[0], words[1:]) == 2
