@@ -211,6 +211,23 @@ def test_a_gltf_cannot_bring_other_files_along(tmp_path):
         chosen("FORMAT", "glb", *IMPORTED)(path, Hints(work=tmp_path))
 
 
+@pytest.mark.parametrize(("children", "words"), [
+    ({0: [0]}, "whose node 0 is in or below a circle, expected a tree of nodes"),
+    ({0: [1], 1: [0]}, "whose node 0 is in or below a circle, expected a tree of nodes"),
+    ({0: [1], 2: [1]}, "whose node 1 has several parents, expected one parent at most"),
+])  # fmt: skip
+def test_a_gltf_whose_nodes_are_no_trees_is_refused(children, words, tmp_path):
+    path = layouts.write_glb(tmp_path / "in" / "a.glb", little())
+
+    def change(tree):
+        tree["nodes"] = [{**node, "children": children.get(k, [])}
+                         for k, node in enumerate(tree["nodes"])]  # fmt: skip
+
+    path.write_bytes(layouts.with_json(path.read_bytes(), change))
+    with pytest.raises(InputError, match=rf"a\.glb.*{words}"):
+        chosen("FORMAT", "glb", *IMPORTED)(path, Hints(work=tmp_path))
+
+
 @pytest.mark.parametrize("wrong", [{"yfov": 0}, {"aspectRatio": 0}, {"yfov": float("inf")}])
 def test_a_camera_of_a_gltf_without_an_angle_is_refused(tmp_path, wrong):
     path = layouts.write_glb(tmp_path / "in" / "a.glb", little())

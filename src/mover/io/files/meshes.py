@@ -7,6 +7,7 @@ behind options of the material. They are found where they lie, at or below the f
 import json
 import re
 import warnings
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BytesIO
@@ -136,6 +137,21 @@ def check_gltf(at: At, path: Path, *, pictures: bool = False) -> None:
     for count, most, what in _amounts(tree):
         if count > most:
             at.refuse(f"at most {most}", f"{at.value!r} with {count} {what}")
+    _check_trees(at, [node.get("children", []) for node in tree.get("nodes", [])])
+
+
+def _check_trees(at: At, children: list[list[int]]) -> None:
+    """Refuse nodes of several parents and nodes in a circle: glTF has trees."""
+    parents = Counter(child for some in children for child in some)
+    for node, count in parents.most_common(1):
+        if count > 1:
+            at.refuse("one parent at most", f"{at.value!r}, whose node {node} has several parents")
+    reached = [node for node in range(len(children)) if node not in parents]
+    for node in reached:  # grows
+        reached.extend(children[node] if node >= 0 else ())
+    if len(reached) < len(children):
+        lost = min({*range(len(children))}.difference(reached))
+        at.refuse("a tree of nodes", f"{at.value!r}, whose node {lost} is in or below a circle")
 
 
 def _uris(tree: Any) -> Iterator[tuple[str, dict[str, str], str]]:  # noqa: ANN401
