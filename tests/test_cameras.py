@@ -352,7 +352,8 @@ def test_every_calibration_gives_the_same_lens(kind, tmp_path):
 OWN = {"w": 960, "h": 540, "fl_x": FX, "fl_y": FY, "cx": CX + 0.5, "cy": CY + 0.5}
 FOUR = {"fx": FX, "fy": FY, "cx": CX, "cy": CY}
 SIZED = LENSES | {
-    "our own": ("camera.json", OWN), "K": ("k.json", {**SIDES, "K": np.ravel(K).tolist()}),
+    "our own": ("camera.json", OWN),
+    "K": ("k.json", {**SIDES, "K": np.ravel(K).tolist()}),
     "four numbers inside": ("n.json", {**SIDES, "intrinsics": FOUR}),
 }
 

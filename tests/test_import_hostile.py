@@ -1,6 +1,7 @@
 """Whatever a source holds: it is imported or refused with a message; nothing in it runs."""
 
 import json
+import re
 import shutil
 import tempfile
 import zipfile
@@ -20,6 +21,7 @@ from mover.core.errors import InputError
 from mover.io.capture.merge import import_into
 from mover.io.capture.parts import Hints
 from mover.io.files.fields import At
+from mover.io.files.meshes import read_mesh
 from mover.io.formats import IMPORTED, chosen
 from mover.io.masks.instance_files import read_instances
 
@@ -209,6 +211,40 @@ def test_a_gltf_cannot_bring_other_files_along(tmp_path):
     path.write_bytes(layouts.with_json(path.read_bytes(), lambda tree: tree.update(images)))
     with pytest.raises(InputError, match="images beside it"):
         chosen("FORMAT", "glb", *IMPORTED)(path, Hints(work=tmp_path))
+
+
+OTHERS = {
+    "a zip archive": (b"PK\x05\x06" + b"\0" * 18, "it is a zip archive: unpack it"),
+    "gzip": (b"\x1f\x8b\x08" + b"\0" * 20, r"it is packed by gzip: unpack it \(gunzip\)"),
+    "JSON": (b'{"a": 1}', "it is JSON: call it .json"),
+    "an array": (layouts.promise(2, 3), "it is an array of NumPy: call it .npy"),
+    "junk": (b"\x07hello there\n", ""),
+}
+OWN_ENDS = {"a zip archive": ("npz",), "JSON": ("json",), "an array": ("npy",)}
+
+
+@pytest.mark.parametrize("what", OTHERS)
+@pytest.mark.parametrize(
+    "ending", ["npy", "npz", "json", "png", "glb", "gltf", "ply", "stl", "off"]
+)
+def test_a_file_of_another_kind_is_named_by_what_it_is(what, ending, tmp_path):
+    content, words = OTHERS[what]
+    path = tmp_path / f"a.{ending}"
+    path.write_bytes(content)
+    is_masks, mesh = ending in ("npy", "npz", "json", "png"), At(path.name, "scene.json", "mesh")
+    with pytest.raises(InputError, match=rf"a\.{ending}") as caught:
+        _ = read_instances(path, {}, None) if is_masks else read_mesh(mesh, tmp_path)
+    own = ending in OWN_ENDS.get(what, ()) or (what, ending) == ("JSON", "gltf")
+    assert own or re.search(words, str(caught.value))
+    pythons = r"magic|Expecting|reading|Not a ply|zip file|UTF-8|char 0|Error|\[\]"
+    assert not re.search(pythons, str(caught.value))
+
+
+def test_a_zip_of_pictures_is_no_file_of_arrays(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("0.png", b"")
+    with pytest.raises(InputError, match=r"a.npz: is a zip archive with 0.png, expected an .npz"):
+        read_instances(tmp_path / "a.npz", {}, None)
 
 
 @pytest.mark.parametrize(("children", "words"), [

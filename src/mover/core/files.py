@@ -32,6 +32,17 @@ INSTEAD = {
     rb"\Z": "it is empty: copy or download it again",
 }
 """What a file may be instead of what was expected, by its first bytes."""
+PICKLES = (".pt", ".pth", ".pkl", ".pickle", ".joblib")
+KNOWN = {
+    rb"PK\x03\x04|PK\x05\x06": ("it is a zip archive: unpack it", (".npz", *PICKLES)),
+    rb"\x1f\x8b": ("it is packed by gzip: unpack it (gunzip)", PICKLES),
+    rb"\x93NUMPY": ("it is an array of NumPy: call it .npy", (".npy", *PICKLES)),
+    rb"glTF": ("it is binary glTF: call it .glb", (".glb",)),
+    rb'\s*(\{\s*["}]|\[\s*[]{])': ("it is JSON: call it .json", (".json", ".gltf")),
+}
+"""The same of files whose names do not end as theirs do."""
+OTHER_WORDS = r"magic string|Not a ply file|Expecting value: line 1 column 1 "
+"""What parsers say of a file that is of another kind."""
 
 
 @contextmanager
@@ -67,8 +78,10 @@ def instead(path: Path) -> str:
     """What a file is in place of what was expected; empty: nothing that is known."""
     if path.is_file():
         with suppress(OSError), path.open("rb") as file:
-            head = file.read(64)
-            return next((w for start, w in INSTEAD.items() if re.match(start, head, re.I)), "")
+            head, kind = file.read(64), path.suffix.lower()
+            others = {k: word for k, (word, own) in KNOWN.items() if kind not in own}
+            every = (INSTEAD | others).items()
+            return next((word for start, word in every if re.match(start, head, re.I)), "")
     return ""
 
 
@@ -83,7 +96,7 @@ def reason(error: Exception, path: Path | None = None) -> str:
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     spoken = isinstance(error, ValueError | RuntimeError | SyntaxError | OSError) or path is None
-    if spoken and str(error):
+    if spoken and str(error) and not re.search(OTHER_WORDS, str(error)):
         return " ".join(str(error).split())[:160]
     return "it is damaged, cut off or of another kind"
 

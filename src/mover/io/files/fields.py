@@ -253,6 +253,9 @@ def _odd_arrays(path: Path) -> dict[str, NotPlain]:
     total, odd = 0, dict[str, NotPlain]()
     with zipfile.ZipFile(path) as archive:
         for entry in archive.infolist():
+            if not entry.filename.endswith(".npy"):
+                found = f"is a zip archive with {entry.filename}"
+                raise InputError(f"{path.name}: {found}, expected an .npz file of arrays")
             with archive.open(entry) as stream:
                 dtype, size = _header(stream)
             total += size

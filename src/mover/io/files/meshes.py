@@ -112,9 +112,11 @@ def check_faces(at: At, faces: NDArray[Any], count: int) -> None:
 
 def gltf_tree(path: Path) -> Any:  # noqa: ANN401
     """The JSON of a .gltf or .glb; what it holds is not checked."""
-    content = path.read_bytes()
+    content, binary = path.read_bytes(), path.suffix.lower() == ".glb"
+    if not content.startswith(b"glTF") if binary else b"\0" in content[:64]:
+        raise ValueError("it is no glTF")
     end = 20 + int.from_bytes(content[12:16], "little")
-    return json.loads(content[20:end] if path.suffix.lower() == ".glb" else content)
+    return json.loads(content[20:end] if binary else content)
 
 
 def check_gltf(at: At, path: Path, *, pictures: bool = False) -> None:

@@ -249,7 +249,7 @@ def read_mask_arrays(path: Path, names: Names, *, people: bool = False) -> Insta
         return _gathered(rows, path.name, "masks", (int(key) for key, _ in frames), said)
     given = at.maybe(*MASKS)
     if given is None:
-        at.refuse(f"an array named {', '.join(MASKS)}", f"the arrays {sorted(at.value)[:6]}")
+        at.refuse(f"an array named {', '.join(MASKS)}", ", ".join(sorted(at.value)[:6]) or "none")
     stack = given.value
     if isinstance(stack, np.ndarray) and stack.ndim == 4 and stack.shape[-1] == 1:
         stack = np.moveaxis(stack, -1, 1)  # (frames, h, w, 1)
