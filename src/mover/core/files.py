@@ -85,6 +85,20 @@ def instead(path: Path) -> str:
     return ""
 
 
+def special(path: Path) -> str:
+    """What is at a path in place of a file; empty: nothing, or a file."""
+    kinds = {
+        "a folder": path.is_dir(), "a pipe": path.is_fifo(), "a socket": path.is_socket(),
+        "a device": path.is_char_device() or path.is_block_device(),
+    }  # fmt: skip
+    return next((kind for kind, there in kinds.items() if there), "")
+
+
+def not_there(path: Path, where: str = "") -> str:
+    """What to say of a path that is no file."""
+    return f"is no file ({what})" if (what := special(path)) else f"there is no such file{where}"
+
+
 def reason(error: Exception, path: Path | None = None) -> str:
     """Why a file cannot be read, in one short line without Python's own words."""
     if path is not None and (found := instead(path)):
@@ -93,6 +107,8 @@ def reason(error: Exception, path: Path | None = None) -> str:
         return "it is no text in UTF-8: save it as UTF-8"
     if "cannot identify image file" in str(error):
         return "it is no picture that can be opened, such as JPEG or PNG"
+    if large := re.match(r"Image size \((\d+) pixels\) exceeds limit of (\d+)", str(error)):
+        return f"it is too large: {large[1]} pixels, at most {large[2]} are read"
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     spoken = isinstance(error, ValueError | RuntimeError | SyntaxError | OSError) or path is None

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
-from mover.core.files import unreadable
+from mover.core.files import not_there, unreadable
 from mover.core.types import Tilt
 from mover.geometry.camera import tilted
 from mover.io.files.fields import LARGEST, At, read_json, read_npy, read_npz
@@ -115,7 +115,7 @@ def _read_camera(path: Path, size: Size) -> At:
         files = (path / name for name in ("cameras.txt", "cameras.bin", "camera.json"))
         path = next((file for file in files if file.is_file()), path)
     if not path.is_file():
-        raise InputError(f"{path}: there is no such file, expected a camera")
+        raise InputError(f"{path}: {not_there(path)}, expected a camera")
     match path.suffix.lower():
         case ".json":
             return camera_of_tree(read_json(path), size)

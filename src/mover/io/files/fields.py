@@ -18,7 +18,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
-from mover.core.files import BROKEN, reason, replacing, unreadable
+from mover.core.files import BROKEN, not_there, reason, replacing, unreadable
 
 log = logging.getLogger(__name__)
 Warn = Callable[[str], None]
@@ -177,7 +177,7 @@ def existing(path: Path, expected: str = "") -> Path:
     if not path.is_file():
         inner = path.parent / "room" / name  # of OUT of `mover video`
         more = f", but in {inner.parent}" if inner.is_file() else more
-        raise InputError(f"{name}: there is no such file in {path.parent}{more}")
+        raise InputError(f"{name}: {not_there(path, f' in {path.parent}')}{more}")
     if (size := path.stat().st_size) > LARGEST_FILE:
         raise InputError(f"{name}: has {size} bytes, expected at most {LARGEST_FILE}")
     return path
@@ -237,18 +237,21 @@ def is_amass(at: At) -> bool:
     return "trans" in keys and "frame" not in keys and not keys.isdisjoint(("poses", "pose_body"))
 
 
-def read_npz(path: Path) -> At:
-    """The arrays of an .npz file by name; one of objects or fields is `NotPlain`."""
+def read_npz(path: Path, most: int = LARGEST_FILE) -> At:
+    """The arrays of an .npz file by name; one of objects or fields is `NotPlain`.
+
+    Of more than `most` bytes together nothing is unpacked.
+    """
     name = existing(path, "an .npz file").name or path.resolve().name
     try:
-        odd = _odd_arrays(path)
+        odd = _odd_arrays(path, most)
         with np.load(path, allow_pickle=False) as arrays:
             return At({key: odd.get(key) or arrays[key] for key in arrays.files}, name)
     except BROKEN as error:
         raise unreadable(path, error, "an .npz file") from error
 
 
-def _odd_arrays(path: Path) -> dict[str, NotPlain]:
+def _odd_arrays(path: Path, most: int) -> dict[str, NotPlain]:
     """Arrays that are not plain; sizes that are promised are checked before any is unpacked."""
     total, odd = 0, dict[str, NotPlain]()
     with zipfile.ZipFile(path) as archive:
@@ -262,8 +265,8 @@ def _odd_arrays(path: Path) -> dict[str, NotPlain]:
             key = entry.filename.removesuffix(".npy")
             if dtype.hasobject or dtype.fields:
                 odd[key] = NotPlain()
-            if total > LARGEST_FILE:
-                found = f"has {total} bytes or more, expected at most {LARGEST_FILE} in the file"
+            if total > most:
+                found = f"has {total} bytes or more, expected at most {most} in the file"
                 raise InputError(f"{path.name}: field '{key}' {found}")
     return odd
 
@@ -286,7 +289,7 @@ def read_npy(path: Path) -> At:
         InputError: If it is missing, broken, promises more than it has or holds pickled objects.
     """
     if not path.is_file():
-        raise InputError(f"{path.name}: there is no such regular file in {path.parent}")
+        raise InputError(f"{path.name}: {not_there(path, f' in {path.parent}')}")
     try:
         with path.open("rb") as file:
             dtype, size = _header(file)

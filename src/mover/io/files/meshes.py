@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
-from mover.core.files import copy_whole, instead, reason, replacing
+from mover.core.files import copy_whole, instead, reason, replacing, special
 from mover.core.types import Mesh, SeatStretch
 from mover.io.files.fields import LARGEST, LARGEST_FILE, At, shown
 
@@ -365,7 +365,10 @@ def inside(at: At, folder: Path) -> Path:
         if not full.is_relative_to(folder.resolve()):
             at.refuse("a file inside the capture's folder", f"{name!r}, a link that leaves it")
         if not full.is_file():
-            at.refuse("a file", f"{shown(name)}, which does not exist")
+            what = special(full)
+            at.refuse(
+                "a file", f"{shown(name)}, which {f'is {what}' if what else 'does not exist'}"
+            )
     except (OSError, RuntimeError) as error:  # names that are too long, links in a circle
         at.refuse("a file", f"{shown(name)}, which cannot be found ({reason(error)})")
     return full

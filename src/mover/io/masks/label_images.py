@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
+from mover.core.pickles import LARGEST
 from mover.io.capture.parts import UNKNOWN
-from mover.io.files.fields import At, read_json, read_npy
+from mover.io.files.fields import At, read_json, read_npy, read_npz
 from mover.io.files.images import opened
 from mover.io.masks.instances import Instance, Instances, Names, Size, code_of, frames_of
 from mover.io.people.values import natural, number_in, read_any
@@ -230,7 +231,8 @@ def read_mask_arrays(path: Path, names: Names, *, people: bool = False) -> Insta
     Boxes are those of the masks. A pickle, or the .npy of a mapping, may also be what SAM 2's video
     predictor gives: {frame: {object: mask}}.
     """
-    at, notes = read_any(path), list[str]()
+    npz = path.suffix.lower() == ".npz"
+    at, notes = read_npz(path, LARGEST) if npz else read_any(path), list[str]()
     if isinstance(at.value, np.ndarray):
         at = at.holding({"masks": at.value})
     match at.value:
@@ -277,7 +279,7 @@ def _cut(at: At, value: NDArray[Any], notes: list[str]) -> NDArray[Any]:
     """Booleans, or whole numbers: logits are cut at 0, probabilities and grey values at half."""
     if value.dtype == np.bool_:
         return value
-    known = value[np.isfinite(value)]
+    known = value[np.isfinite(value)] if value.dtype.kind == "f" else value
     low, top = float(known.min(initial=0)), float(known.max(initial=0))
     if low < 0:
         return value > 0

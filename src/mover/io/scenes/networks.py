@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
+from mover.core.files import not_there
 from mover.core.types import Capture, Mesh
 from mover.geometry.rotations import affine
 from mover.io.capture.folder import build_capture
@@ -100,7 +101,7 @@ class TotalBox:
 def load_mat(path: Path) -> At:
     """The arrays of a MATLAB file, read in a process of its own."""
     if not path.is_file():
-        raise InputError(f"{path.name}: there is no such file in {path.parent}")
+        raise InputError(f"{path.name}: {not_there(path, f' in {path.parent}')}")
     call = [sys.executable, "-P", "-c", READ, str(path.resolve())]
     done = subprocess.run(call, capture_output=True, check=False)
     said = pickle.loads(done.stdout) if done.returncode == 0 else "its reader died"
