@@ -153,6 +153,41 @@ def test_frames_keep_their_numbers_over_gaps_and_a_person_is_one_track(way, tmp_
         assert off <= (0.15 if "soft" in way or "jpg" in way else 0)
 
 
+BOTH = {  # how pictures of two in each frame are called, and what is said of it
+    "00000/0.png": ("{0:05d}/{1}.png", "folders like 00000 are frames"),
+    "frame_0001/person_1.png": ("frame_{0:04d}/person_{1}.png", "folders like frame_0000 are"),
+    "0/0.png": ("{0}/{1}.png", "folders like 0 are frames"),
+    "00000_0.png": ("{0:05d}_{1}.png", "names like 00000_0 are of a frame and of a person"),
+    "frame_000-obj1.png": ("frame_{0:03d}-obj{1}.png", "names like frame_000-obj0 are of a frame"),
+    "001/00000.png": ("{1:03d}/{0:05d}.png", ""), "1/00000.png": ("{1}/{0:05d}.png", ""),
+    "person_1/0.png": ("person_{1}/{0}.png", ""), "p_001/0.png": ("p_{1:03d}/{0}.png", ""),
+    "00001/00000.png": ("{1:05d}/{0:05d}.png", ""),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("way", BOTH)
+def test_names_and_folders_are_those_of_frames_or_of_people(way, tmp_path):
+    name, said = BOTH[way]
+    wanted = {(k, t): walker(k, 4 + 28 * t) for k in KEPT for t in (0, 1) if (k, t) != (2, 1)}
+    for (frame, track), mask in wanted.items():
+        path = tmp_path / "in" / name.format(frame, track)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        white(mask).save(path)
+    found = read_people(tmp_path / "in", {}, None)
+    got = pixels(found)
+    assert got.keys() == wanted.keys()
+    assert all((got[key] == mask).all() for key, mask in wanted.items())
+    assert said in "; ".join(found.notes)
+    assert bool(said) == any("like" in note for note in found.notes)
+
+
+def test_things_that_are_numbered_twice_are_things_of_one_picture(tmp_path):
+    for number in (0, 1):
+        white(walker(0, 4 + 28 * number)).save(tmp_path / f"chair_001_{number}.png")
+    found = read_things(tmp_path, {}, None)
+    assert [(i.category, i.frame, i.track) for i in found.items] == [("chair", 0, None)] * 2
+
+
 @pytest.mark.parametrize("boxes", [True, False])
 def test_people_without_tracks_are_followed_by_place_not_by_score(boxes, tmp_path):
     """The one with the better score alternates, and so does their order (k34)."""

@@ -223,13 +223,13 @@ PIPED = ["a.npy", "a.npz", "a.json", "a.png", "a.pkl"]
 @pytest.mark.parametrize("name", PIPED)
 def test_a_pipe_a_device_and_a_folder_are_no_files(name, tmp_path):
     os.mkfifo(tmp_path / name)
-    with pytest.raises(InputError, match=rf"^{name}: .*(it is|is no file .)a pipe"):
+    with pytest.raises(InputError, match=rf"^{name}: .*(it is |is no file .)a pipe"):
         read_instances(tmp_path / name, {}, None)
-    with pytest.raises(InputError, match=rf"{name}: .*(it is|is no file .)a pipe"):
+    with pytest.raises(InputError, match=rf"{name}: .*(it is |is no file .)a pipe"):
         read_camera_file(tmp_path / name, None)
     (tmp_path / name).unlink()
     (tmp_path / name).symlink_to("/dev/null")
-    with pytest.raises(InputError, match=rf"^{name}: .*(it is|is no file .)a device"):
+    with pytest.raises(InputError, match=rf"^{name}: .*(it is |is no file .)a device"):
         read_instances(tmp_path / name, {}, None)
     with pytest.raises(InputError, match=rf"{name}: is no file \(a device\), expected a video or"):
         video_to_room(VideoArgs(tmp_path / name, out=tmp_path / "out"))

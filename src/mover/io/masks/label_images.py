@@ -49,28 +49,29 @@ def read_label_images(
     channel that is not full, or with one value beside black, is one mask, soft rims or not; one
     with more values is a label map (a pixel is the number of a thing, 0 is nothing). Pictures whose
     names are the numbers of frames are a video, in which a label is a track. In a folder of folders
-    (SAM 2's) each is one object of a video. `source` is the folder or file that the user named; of
-    `people`, frames may have short numbers, too.
+    each is one object of a video (SAM 2's), or a frame (00000/0.png, as 00000_0.png). `source` is
+    the folder or file that the user named; of `people`, frames may have short numbers, too.
     """
     home = source if source.is_dir() else source.parent
     beside = read_json(home / LABELS) if (home / LABELS).is_file() else At({}, LABELS)
     table = {**{key: beside.get(key).text() for key in beside.mapping()}, **names}
     if source.is_dir():
         paths = sorted((p for p in paths if p.stem.lower() not in NOT_MASKS), key=natural)
-    homes = list(dict.fromkeys(path.parent for path in paths))
-    apart = source.is_dir() and source not in homes
-    numbers = _numbers_of([path.stem for path in paths], people=people or apart)
+    owners, framed, how = _things_and_frames(paths, source)
+    apart, ranks = bool(owners), list(dict.fromkeys(owners))
+    numbers = _numbers_of(framed, people=people or apart)
     if apart and numbers is None:
         bare = next((p.name for p in paths if not re.search(r"\d", p.stem)), paths[0].name)
         raise InputError(f"{bare}: has no number of a frame in its name")
     frames, notes = frames_of(list((numbers or {}).values()), f"{source.name}: numbers")
+    notes += (f"{source.name}: {how}",) if how else ()
 
     def rows() -> Iterator[Row]:
-        for path in paths:
-            frame = None if numbers is None else frames[numbers[path.stem]]
+        for k, path in enumerate(paths):
+            frame = None if numbers is None else frames[numbers[framed[k]]]
             if apart:
-                name = names.get(path.parent.name) or _word_of(path.parent.name) or UNKNOWN
-                track = number_in(path.parent.name, homes.index(path.parent))
+                name = names.get(owners[k]) or _word_of(owners[k]) or UNKNOWN
+                track = number_in(owners[k], ranks.index(owners[k]))
                 yield _labels_of(path) > 0, Instance(name, None, None, 1.0, frame or 0, track)
             else:
                 yield from _labelled(path, {**_classes_beside(path), **table}, frame)
@@ -84,6 +85,30 @@ def read_label_images(
         how = "pictures are people of one image; those of frames are named by numbers: 000000.png"
         notes = (*notes, f"{source.name}: {how}")
     return replace(found, notes=notes)
+
+
+def _things_and_frames(paths: Sequence[Path], source: Path) -> tuple[list[str], list[str], str]:
+    """Names of the thing (none: it has no name) and of the frame of each picture, and a note."""
+    stems, folders = [path.stem for path in paths], [path.parent.name for path in paths]
+    if not source.is_dir() or any(path.parent == source for path in paths):
+        pairs = [re.fullmatch(r"(\D*\d{3,})[_-](\D*\d{1,2})", stem) for stem in stems]
+        found = [pair for pair in pairs if pair is not None]
+        framed = [pair[1] for pair in found]
+        if len(found) < len(paths) or not _are_frames(framed):
+            return [], stems, ""
+        said = f"names like {stems[0]} are of a frame and of a person or thing in it"
+        return [pair[2] for pair in found], framed, said
+    short, long = (min(len(re.sub(r"\D", "", s)) for s in some) for some in (stems, folders))
+    more = len(set(folders)) > len(set(stems))
+    if not _are_frames(folders) or len(set(stems)) == len(stems) or (long, more) < (short, True):
+        return folders, stems, ""
+    return stems, folders, f"folders like {folders[0]} are frames, with the people or things in it"
+
+
+def _are_frames(names: list[str]) -> bool:
+    """Whether names are numbers, alone or behind words for frames."""
+    words = set(re.split(r"[\W_\d]+", " ".join(names).lower()))
+    return words <= FRAME_WORDS and _numbers_of(names, people=True) is not None
 
 
 def _labelled(path: Path, words: Names, frame: int | None) -> Iterator[Row]:
