@@ -226,6 +226,22 @@ def test_a_stack_of_frames_is_a_person_and_one_of_apart_masks_are_people(tmp_pat
     assert any("3 masks are people of one image" in note for note in found.notes)
 
 
+@pytest.mark.parametrize("shape", ["objects first", "frames first"])
+@pytest.mark.parametrize("count", [2, 6, 9])
+def test_the_axis_of_frames_is_that_along_which_masks_overlap(shape, count, tmp_path):
+    two = np.stack([[walker(k, 4 + 28 * t) for t in (0, 1)] for k in range(count)])
+    stack = two if shape == "frames first" else two.swapaxes(0, 1)
+    axes = "(frames, objects, h, w)" if shape == "frames first" else "(objects, frames, h, w)"
+    for name, more in (("a", {}), ("b", {"object_ids": np.arange(2)})):
+        np.savez(tmp_path / f"{name}.npz", masks=stack, **more)
+        found = read_people(tmp_path / f"{name}.npz", {}, None)
+        said = f"{name}.npz: masks {axes}, 2 people or things in {count} frames"
+        assert any(note.startswith(said) for note in found.notes)
+        got = pixels(found)
+        assert got.keys() == {(k, t) for k in range(count) for t in (0, 1)}
+        assert all((mask == two[key]).all() for key, mask in got.items())
+
+
 @pytest.mark.parametrize("apart", [False, True])
 @pytest.mark.parametrize("shape", ["fhw", "f1hw", "fhw1"])
 def test_a_map_of_labels_a_frame_has_a_track_a_label(shape, apart, tmp_path):

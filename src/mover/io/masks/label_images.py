@@ -248,13 +248,13 @@ def _hardened(pixels: NDArray[np.int64], name: str, *, lossy: bool) -> NDArray[n
 def read_mask_arrays(path: Path, names: Names, *, people: bool = False) -> Instances:
     """Masks of an .npz, an .npy or a pickle.
 
-    `masks` is (n, h, w), (n, 1, h, w) or (frames, objects, h, w), as booleans, bytes, probabilities
-    (from 0 to 1, cut at .5) or logits (above 0 is inside); or a label map of whole numbers, (h, w),
-    or one for each frame, in which a label is a track. Beside it may stand `scores`, `labels`
-    (names), `object_ids` and `frame`. With a single object id (n, 1, h, w) is one thing in n
-    frames, and so is that of people without ids, as are n masks of people that lie on each other.
-    Boxes are those of the masks. A pickle, or the .npy of a mapping, may also be what SAM 2's video
-    predictor gives: {frame: {object: mask}}.
+    `masks` is (n, h, w), (n, 1, h, w), (frames, objects, h, w) or (objects, frames, h, w), as
+    booleans, bytes, probabilities (from 0 to 1, cut at .5) or logits (above 0 is inside); or a
+    label map of whole numbers, (h, w), or one for each frame, in which a label is a track. Beside
+    it may stand `scores`, `labels` (names), `object_ids` and `frame`. With a single object id
+    (n, 1, h, w) is one thing in n frames, and so is that of people without ids, as are n masks of
+    people that lie on each other. Boxes are those of the masks. A pickle, or the .npy of a mapping,
+    may also be what SAM 2's video predictor gives: {frame: {object: mask}}.
     """
     npz = path.suffix.lower() == ".npz"
     at, notes = read_npz(path, LARGEST) if npz else read_any(path), list[str]()
@@ -277,14 +277,9 @@ def read_mask_arrays(path: Path, names: Names, *, people: bool = False) -> Insta
     given = at.maybe(*MASKS)
     if given is None:
         at.refuse(f"an array named {', '.join(MASKS)}", ", ".join(sorted(at.value)[:6]) or "none")
-    stack = given.value
-    if isinstance(stack, np.ndarray) and stack.ndim == 4 and stack.shape[-1] == 1:
-        stack = np.moveaxis(stack, -1, 1)  # (frames, h, w, 1)
-    if not isinstance(stack, np.ndarray) or stack.dtype.kind not in "buif" or stack.ndim < 2:
-        given.refuse("an array of masks (n, h, w), (frames, objects, h, w) or labels (h, w)")
-    if stack.ndim > 4 or not stack.size:
-        given.refuse("an array of masks (n, h, w) or (frames, objects, h, w)")
-    stack = _cut(given, stack, notes)
+    stack = _cut(given, _stack_of(given), notes)
+    if stack.ndim == 4 and 1 not in stack.shape[:2]:
+        stack = _frames_first(at, stack, notes)
     flat, size = stack.reshape(-1, *stack.shape[-2:]), (stack.shape[-1], stack.shape[-2])
     if stack.dtype == np.bool_ or (stack.ndim > 2 and not _are_maps(stack)):
         found = _of_stack(at, stack, names, people=people)
@@ -298,6 +293,15 @@ def read_mask_arrays(path: Path, names: Names, *, people: bool = False) -> Insta
         for track in (None if still else v,)
     )
     return replace(_gathered(rows, at.file, "masks", () if still else numbers), size=size)
+
+
+def _stack_of(at: At) -> NDArray[Any]:
+    """An array of masks or labels, the picture's axes behind."""
+    stack = at.value
+    known = isinstance(stack, np.ndarray) and stack.dtype.kind in "buif" and stack.size
+    if not known or not 2 <= stack.ndim <= 4:
+        at.refuse("an array of masks (n, h, w), (frames, objects, h, w) or labels (h, w)")
+    return np.moveaxis(stack, -1, 1) if stack.ndim == 4 and stack.shape[-1] == 1 else stack
 
 
 def _cut(at: At, value: NDArray[Any], notes: list[str]) -> NDArray[Any]:
@@ -359,7 +363,7 @@ def _of_stack(at: At, stack: NDArray[Any], names: Names, *, people: bool) -> Ins
     rows, tracks, notes = len(flat), None, ()
     bare = people and ids is None and frame is None and (stack.ndim < 4 or 1 in stack.shape[:2])
     sam = stack.ndim == 4 and stack.shape[1] == 1
-    in_frames = bare and rows > 1 and (sam or _follow_each_other(flat))
+    in_frames = bare and rows > 1 and (sam or _overlap(flat) > SAME)
     if bare and rows > 1:
         how = "are people of one image; frames need an array 'frame' or 'object_ids' beside"
         if in_frames:
@@ -379,7 +383,8 @@ def _of_stack(at: At, stack: NDArray[Any], names: Names, *, people: bool) -> Ins
     labels, sure = [UNKNOWN] * rows, np.ones(rows)
     if words is not None and isinstance(words.value, np.ndarray) and words.value.dtype.kind == "U":
         labels = [str(word) for word in words.array((rows,), "text")]
-    if scores is not None and isinstance(scores.value, np.ndarray) and scores.value.size == rows:
+    shapes = (rows,), stack.shape[:2], (rows, 1)
+    if scores is not None and np.shape(scores.value) in shapes:
         sure = np.clip(scores.array(scores.value.shape).reshape(-1), 0, 1)
 
     def row(i: int) -> Instance:
@@ -391,11 +396,24 @@ def _of_stack(at: At, stack: NDArray[Any], names: Names, *, people: bool) -> Ins
     return _gathered(things, at.file, "masks", frames.tolist(), notes)
 
 
-def _follow_each_other(flat: NDArray[Any]) -> bool:
-    """Whether masks lie on each other as those of one person in the frames of a video do."""
+def _frames_first(at: At, stack: NDArray[Any], notes: list[str]) -> NDArray[Any]:
+    """A stack (frames, objects, h, w); of which axis frames are, ids say, else overlaps do."""
+    a, b = stack.shape[:2]
+    ids, turned = at.maybe(*TRACKS), np.swapaxes(stack, 0, 1)
+    known = a != b and ids is not None and np.size(ids.value) in (a, b)
+    other = np.size(ids.value) == a if ids and known else _overlap(turned) > _overlap(stack)
+    how = "(objects, frames, h, w)" if other else "(frames, objects, h, w)"
+    few, many = (a, b) if other else (b, a)
+    said = "" if known else ": they overlap from frame to frame"
+    notes.append(f"{at.file}: masks {how}, {few} people or things in {many} frames{said}")
+    return turned if other else stack
+
+
+def _overlap(stack: NDArray[Any]) -> float:
+    """How much of them masks share with the next along the first axis, as those of one person."""
     shares = list[float]()
-    for one, other in zip(flat[:-1] > 0, flat[1:] > 0, strict=True):
-        least = min(int(one.sum()), int(other.sum()))
-        if least:
-            shares.append(int((one & other).sum()) / least)
-    return len(shares) > 0 and float(np.median(shares)) > SAME
+    for one, other in zip(stack[:-1] > 0, stack[1:] > 0, strict=True):
+        sizes = np.minimum(one.sum((-2, -1)), other.sum((-2, -1)))
+        both = (one & other).sum((-2, -1))
+        shares += (both[sizes > 0] / sizes[sizes > 0]).ravel().tolist()
+    return float(np.median(shares)) if shares else 0.0
