@@ -299,6 +299,24 @@ def test_masks_alone_make_a_part_and_what_is_missing_is_said(tmp_path, capsys):
     assert (new / "reference.png").is_file()
 
 
+@pytest.mark.parametrize("wrong", [(1,), (0, 1, 2, 3)])
+def test_each_mask_that_is_inverted_is_named(wrong, tmp_path, capsys):
+    masks = drawn()
+    masks[list(wrong)] ^= True
+    files = layouts.write_masks(tmp_path / "in", masks, ["chair", "couch"] * 2)
+    picture_of = picture(tmp_path / "a.png", (64, 48))
+    people = tmp_path / "people.npz"
+    video = np.repeat(masks[:2], 3, axis=0).reshape(2, 3, 48, 64)
+    np.savez(people, masks=video.swapaxes(0, 1), object_ids=np.array([4, 9]))
+    run_import(ImportArgs("masks", files["coco_text"], tmp_path / "out", image=picture_of, fov=60.0,
+                          people_masks=people))  # fmt: skip
+    said = capsys.readouterr().out
+    names = [f"{('chair', 'couch')[i % 2]} ({i})" for i in wrong]
+    assert f"masks of {', '.join(names)} fill the picture to its borders; inverted?" in said
+    names = [f"person {(4, 9)[i]}" for i in wrong if i < 2]
+    assert f"people.npz: masks of {', '.join(names)} fill the picture to its borders" in said
+
+
 def test_nothing_is_written_when_a_part_does_not_fit_or_there_is_none(plain, tmp_path):
     out = tmp_path / "out"
     capture_of("total3d", layouts.write_total3d(tmp_path / "in", plain), tmp_path)
