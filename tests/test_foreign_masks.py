@@ -299,7 +299,7 @@ def test_soft_labels_are_labels_and_a_dancer_is_a_person(tmp_path):
     assert any("'dancer' taken as people's" in note for note in people.notes)
     del rows[0]["mask"]
     boxes = read_people(save(tmp_path, rows), {}, None)
-    assert "a.json: 1 boxes have no mask, which people need: left out" in boxes.notes
+    assert "a.json: boxes without mask, which people need, left out: 1" in boxes.notes
 
 
 def grounded(folder: Path) -> Path:
@@ -313,10 +313,57 @@ def grounded(folder: Path) -> Path:
 
 def mmdet(folder: Path) -> Path:
     """outputs/preds/a.json of mmdet's DetInferencer (mmdet/apis/det_inferencer.py: pred2dict)."""
-    tree = {"labels": [56, 0, 60], "scores": [0.9, 0.8, 0.05],
+    return save(folder, predictions(0))
+
+
+def predictions(frame: int) -> dict[str, Any]:
+    return {"labels": [56, 0, 60], "scores": [0.9, 0.8, 0.05],
             "bboxes": [[4, 10, 18, 40], [0, 0, 9, 9], [0, 0, 5, 5]],
-            "masks": [code(walker(0)), code(walker(3, 30)), code(walker(0, 9))]}  # fmt: skip
-    return save(folder, tree)
+            "masks": [code(walker(0)), code(walker(frame, 30)), code(walker(0, 9))]}  # fmt: skip
+
+
+FRAMES = [predictions(frame) for frame in range(4)]
+
+
+@pytest.mark.parametrize("tree", [
+    FRAMES, {"predictions": FRAMES, "visualization": []}, [{"predictions": [p]} for p in FRAMES],
+])  # fmt: skip
+def test_entries_of_mmdetection_are_frames(tree, tmp_path):
+    path = save(tmp_path, tree)
+    found = read_people(path, {}, None)
+    got = pixels(found)
+    assert list(got) == [(k, 0) for k in range(4)]
+    assert all((mask == walker(k, 30)).all() for (k, _), mask in got.items())
+    assert "a.json: 4 entries of MMDetection are frames in their order" in found.notes
+    (chair_of_2,) = read_things(path, {}, None, "000002.png").items
+    assert (chair_of_2.category, chair_of_2.frame) == ("chair", 2)
+
+
+def test_a_list_of_other_objects_is_named_by_their_fields(tmp_path):
+    path = save(tmp_path, [{"boxes": [[0, 0, 9, 9]], "ids": [1]}])
+    with pytest.raises(InputError, match=r"'\[0\]' has an object of boxes, ids, expected a detec"):
+        read_things(path, {}, None)
+
+
+@pytest.mark.parametrize("kind", ["masks", "labels"])
+def test_a_folder_of_arrays_has_an_array_a_frame(kind, tmp_path):
+    for frame in KEPT:
+        both = np.stack([walker(frame, 34), walker(frame)])
+        if kind == "labels":
+            np.savez(tmp_path / f"mask_{frame:05d}.npz", masks=both[0] * 2 + both[1] * 5)
+        else:
+            ids = np.array([2, 5])
+            np.savez(tmp_path / f"mask_{frame:05d}.npz", masks=both, object_ids=ids)
+    got = pixels(read_people(tmp_path, {}, None))
+    assert got.keys() == {(k, t) for k in KEPT for t in (2, 5)}
+    assert all((mask == walker(k, 34 if t == 2 else 4)).all() for (k, t), mask in got.items())
+    np.savez(tmp_path / "mask_00009.npz", masks=np.stack([walker(k) * 3 for k in range(3)]),
+             frame=np.arange(3))  # fmt: skip
+    with pytest.raises(InputError, match=r"6 files, of which mask_00009.npz has several frames"):
+        read_people(tmp_path, {}, None)
+    for path in tmp_path.glob("mask_0000[0-8].npz"):
+        path.unlink()
+    assert list(pixels(read_people(tmp_path, {}, None))) == [(k, 0) for k in range(3)]
 
 
 @pytest.mark.parametrize("write", [grounded, mmdet])
@@ -349,11 +396,19 @@ def test_of_many_images_only_ours_counts_and_this_is_said(tmp_path):
         read_things(path, {}, (W, H), "x.png")
 
 
-def chair(folder: Path, drawn: Any, **more: Any) -> Instances:
+def chair(folder: Path, drawn: Any, *, file: str = "", **more: Any) -> Instances:
     row = {"id": 1, "image_id": 0, "category_id": 1, "segmentation": drawn, **more}
-    tree = {"images": [{"id": 0, "width": W, "height": H}], "annotations": [row],
-            "categories": [{"id": 1, "name": "chair"}]}  # fmt: skip
-    return read_things(save(folder, tree), {}, None)
+    image = {"id": 0, "width": W, "height": H, "file_name": file}
+    tree = {"images": [image], "annotations": [row], "categories": [{"id": 1, "name": "chair"}]}
+    return read_things(save(folder, tree), {}, None, "room.png")
+
+
+@pytest.mark.parametrize("file", ["", "images/Room.JPG", "other.jpg"])
+def test_a_lone_image_of_another_name_is_taken_and_this_is_said(file, tmp_path):
+    found = chair(tmp_path, [SQUARE], file=file)
+    said = f"a.json: its only image, {file}, is taken for room.png"
+    assert found.notes == ((said,) if file == "other.jpg" else ())
+    assert [item.category for item in found.items] == ["chair"]
 
 
 @pytest.mark.parametrize("nothing", [[], [[]], None])
@@ -366,10 +421,23 @@ SQUARE = [[4, 10], [18, 10], [18, 40], [4, 40]]
 TEXT = {"size": f"[{H}, {W}]", "counts": compressed(runs(walker(0)))}
 
 
-@pytest.mark.parametrize("drawn", [[SQUARE], [SQUARE, []], TEXT])
+COUNTS = {"size": [H, W], "counts": str(runs(walker(0)))}
+
+
+@pytest.mark.parametrize("drawn", [[SQUARE], [SQUARE, []], TEXT, COUNTS])
 def test_other_spellings_of_a_mask_are_the_same_mask(drawn, tmp_path):
     (mask,) = pixels(chair(tmp_path, drawn)).values()
     assert (mask == walker(0)).all()
+
+
+@pytest.mark.parametrize(("drawn", "words"), [
+    ([[4, 10, 18, 10, 18, 40, 4]], "has polygon 0 with 7 numbers, an odd count, expected numbers"),
+    ("iVBORw0KGgoAAAANSUhEUgAAAA/z=", "has a picture in base64, expected COCO's compressed code"),
+    ({"size": [H, W], "counts": "data:image/png;base64,iVBO"}, "has a picture in base64"),
+])  # fmt: skip
+def test_what_is_no_mask_is_named(drawn, words, tmp_path):
+    with pytest.raises(InputError, match=rf"segmentation' {words}"):
+        chair(tmp_path, drawn)
 
 
 def test_a_track_of_cvat_is_an_attribute(tmp_path):

@@ -77,7 +77,7 @@ def test_shapes_of_labelme_are_filled_and_those_of_a_group_are_one(tmp_path):
     ]
     found = read_instances(layouts.write_labelme(tmp_path / "a.json", shapes), {}, None)
     assert found.size == (64, 48)
-    assert found.notes == ("a.json: 1 shapes of points or lines are passed over",)
+    assert found.notes == ("a.json: shapes of points or lines passed over: 1",)
     assert [item.category for item in found.items] == ["chair", "lamp", "chair"]
     truth = np.zeros((3, 48, 64), dtype=bool)
     truth[0, 10:25, 10:30] = truth[0, 10:14, 40:44] = True

@@ -152,6 +152,9 @@ def shown(value: Any) -> str:  # noqa: ANN401
         return "nothing"
     if isinstance(value, np.ndarray):
         return f"shape {value.shape} of {value.dtype}"
+    if isinstance(value, Mapping):
+        keys = [str(key) for key in value]
+        return f"an object of {', '.join(keys[:6])[:60]}" if keys else "an empty object"
     if isinstance(value, int) and abs(value) > 10**18:
         return "a huge number"
     text = json.dumps(value) if isinstance(value, str) else repr(value)

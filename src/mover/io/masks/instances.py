@@ -111,7 +111,7 @@ class Instances:
                 raise InputError(f"{self.file}: has no people, only {named}, {wanted}")
             notes.append(f"{named} taken as people's")
         if bare := sum(item.mask is None for item in kept):
-            notes.append(f"{self.file}: {bare} boxes have no mask, which people need: left out")
+            notes.append(f"{self.file}: boxes without mask, which people need, left out: {bare}")
         return dataclasses.replace(self, items=tuple(kept), notes=tuple(notes))
 
     def objects_tree(self) -> At:
@@ -309,7 +309,7 @@ def labelme_instances(at: At) -> Instances:
     for (label, _), codes in groups.items():
         whole: Any = coco.merge(codes) if codes else {}
         found.append(Instance(label, None, whole.get("counts")))
-    said = f"{at.file}: {len(items) - len(areas)} shapes of points or lines are passed over"
+    said = f"{at.file}: shapes of points or lines passed over: {len(items) - len(areas)}"
     return Instances(tuple(found), size, at.file, notes=(said,) if areas != items else ())
 
 

@@ -284,15 +284,14 @@ def read_mask_arrays(path: Path, names: Names, *, people: bool = False) -> Insta
     if stack.dtype == np.bool_ or (stack.ndim > 2 and not _are_maps(stack)):
         found = _of_stack(at, stack, names, people=people)
         return replace(found, notes=(*notes, *found.notes))
-    still, frame = stack.ndim == 2, at.maybe("frame")
+    frame = at.maybe("frame")
     numbers = range(len(flat)) if frame is None else frame.indices(len(flat)).tolist()
     rows = (
-        (pixels == v, Instance(names.get(str(v), UNKNOWN), None, None, 1.0, number, track))
+        (pixels == v, Instance(names.get(str(v), UNKNOWN), None, None, 1.0, number, v))
         for number, pixels in zip(numbers, flat, strict=True)
         for v in _labels_in(given.holding(pixels))
-        for track in (None if still else v,)
     )
-    return replace(_gathered(rows, at.file, "masks", () if still else numbers), size=size)
+    return replace(_gathered(rows, at.file, "masks", () if stack.ndim == 2 else numbers), size=size)
 
 
 def _stack_of(at: At) -> NDArray[Any]:

@@ -160,6 +160,8 @@ def people_of(at: At) -> list[tuple[int, At]]:
     """The people of a list, or of a mapping from track to person, by their keys or in order."""
     if isinstance(at.value, list | tuple):
         at = at.holding({str(number): one for number, one in enumerate(at.value)})
+    if is_amass(at):
+        raise InputError(f"{at.file}: is {AMASS}")
     keys = list(at.mapping())
     if not keys:
         raise InputError(f"{at.place} has no people, expected at least one track")

@@ -311,18 +311,22 @@ def _things(folder: Path) -> tuple[list[Path], list[str]]:
     meshes = [path for path in paths if path not in clouds]
     once = {path.stem: path for path in reversed(meshes)}  # the first of each name
     if not once:
-        found = f"{len(clouds)} files of points or splats, " if clouds else ""
+        passed = [path.name for path in clouds]
+        found = f"{listed('file', passed)} of points or splats, " if clouds else ""
         wanted = "expected <name>.glb with <name>.npz or .json"
         raise InputError(f"{folder}: has {found}no meshes, {wanted}")
+    posed = {p for p in once.values() if any(p.with_suffix(kind).is_file() for kind in TREES)}
+    bare = [] if not posed else [p for p in once.values() if p not in posed]
     notes = [
         f"{listed('file', [p.name for p in passed])} {why}: passed over"
         for passed, why in (
             (clouds, "of points without faces, as Gaussian splats are"),
             ([p for p in meshes if p != once[p.stem]], "of the name of another mesh"),
+            (bare, "without a pose (.npz or .json) beside it"),
         )
         if passed
     ]
-    return [p for p in meshes if p == once[p.stem]], notes
+    return [p for p in meshes if p == once[p.stem] and p not in bare], notes
 
 
 def _pose_beside(path: Path) -> At:
