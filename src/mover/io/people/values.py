@@ -80,8 +80,11 @@ def only_file(path: Path, what: str, *patterns: str) -> Path:
 
 
 def read_one(path: Path, what: str, *patterns: str) -> At:
-    """The content of the file itself, or of the only one of a folder."""
-    return read_any(only_file(path, what, *patterns))
+    """The content of the file itself, or of the only one of a folder, which is not AMASS's."""
+    at = read_any(only_file(path, what, *patterns))
+    if isinstance(at.value, Mapping) and is_amass(at):
+        raise InputError(f"{at.file}: is {AMASS}")
+    return at
 
 
 def number_in(name: str, index: int) -> int:
@@ -160,8 +163,6 @@ def people_of(at: At) -> list[tuple[int, At]]:
     """The people of a list, or of a mapping from track to person, by their keys or in order."""
     if isinstance(at.value, list | tuple):
         at = at.holding({str(number): one for number, one in enumerate(at.value)})
-    if is_amass(at):
-        raise InputError(f"{at.file}: is {AMASS}")
     keys = list(at.mapping())
     if not keys:
         raise InputError(f"{at.place} has no people, expected at least one track")
