@@ -235,8 +235,8 @@ def test_the_axis_of_frames_is_that_along_which_masks_overlap(shape, count, tmp_
     for name, more in (("a", {}), ("b", {"object_ids": np.arange(2)})):
         np.savez(tmp_path / f"{name}.npz", masks=stack, **more)
         found = read_people(tmp_path / f"{name}.npz", {}, None)
-        said = f"{name}.npz: masks {axes}, 2 people or things in {count} frames"
-        assert any(note.startswith(said) for note in found.notes)
+        said = f"{name}.npz: masks {axes}: 2 people or things in {count} frames"
+        assert said in found.notes
         got = pixels(found)
         assert got.keys() == {(k, t) for k in range(count) for t in (0, 1)}
         assert all((mask == two[key]).all() for key, mask in got.items())

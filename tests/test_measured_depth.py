@@ -177,7 +177,7 @@ def test_a_pipe_as_depth_is_refused_at_once(kind, folder, tmp_path, capture):
     (tmp_path / folder).mkdir()
     os.mkfifo(tmp_path / folder / f"000000.{kind}")
     file, metric = find_depth_file(tmp_path)
-    with pytest.raises(InputError, match=rf"000000\.{kind}: .*(it is |is no file .)a pipe"):
+    with pytest.raises(InputError, match=rf"000000\.{kind}: .*is no file \(a pipe\)"):
         read_depth(file, capture.scene.camera, metric=metric)
 
 

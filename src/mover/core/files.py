@@ -85,18 +85,13 @@ def instead(path: Path) -> str:
     return ""
 
 
-def special(path: Path) -> str:
-    """What is at a path in place of a file; empty: nothing, or a file."""
+def not_there(path: Path, missing: str = "there is no such file") -> str:
+    """What to say of a path that is no file: a pipe is there, or nothing."""
     kinds = {
         "a folder": path.is_dir(), "a pipe": path.is_fifo(), "a socket": path.is_socket(),
         "a device": path.is_char_device() or path.is_block_device(),
     }  # fmt: skip
-    return next((kind for kind, there in kinds.items() if there), "")
-
-
-def not_there(path: Path, where: str = "") -> str:
-    """What to say of a path that is no file."""
-    return f"is no file ({what})" if (what := special(path)) else f"there is no such file{where}"
+    return next((f"is no file ({kind})" for kind, there in kinds.items() if there), missing)
 
 
 def reason(error: Exception, path: Path | None = None) -> str:

@@ -64,7 +64,7 @@ def load_plain(path: Path) -> Any:  # noqa: ANN401
     """
     name = path.name
     if not path.is_file():
-        raise InputError(f"{name}: {not_there(path, f' in {path.parent}')}, expected a pickle")
+        raise InputError(f"{name}: {not_there(path)}, expected a pickle")
     try:
         if path.stat().st_size > LARGEST:
             raise InputError(f"has {path.stat().st_size} bytes, expected at most {LARGEST}")

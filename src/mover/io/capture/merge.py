@@ -284,8 +284,7 @@ def _check_apart(whole: Parts) -> Iterator[str]:
         masks = {name: masks for other, name, masks in groups if other == file}
         odd = [name for name, of_one in masks.items() if agree.bounded([of_one]).mean() < MOST]
         if odd:
-            names = ", ".join(odd[:6]) + " ..." * (len(odd) > 6)
-            yield f"{file}: masks of {names} fill the picture to its borders; inverted?"
+            yield f"{file}: masks fill the picture to its borders, inverted? {', '.join(odd[:9])}"
 
 
 def _camera_of(whole: Parts) -> Camera | None:

@@ -13,10 +13,10 @@ import torch
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
-from mover.core.files import not_there, unreadable
+from mover.core.files import unreadable
 from mover.core.types import Tilt
 from mover.geometry.camera import tilted
-from mover.io.files.fields import LARGEST, At, read_json, read_npy, read_npz
+from mover.io.files.fields import LARGEST, At, existing, read_json, read_npy, read_npz
 from mover.io.files.images import ORIENTATION, opened
 from mover.io.files.schema import Positive, Side, checked
 
@@ -88,11 +88,7 @@ def read_camera_file(path: Path, size: Size) -> At:
 
 
 def in_pixels_of(size: Size, at: At) -> At:
-    """The fields of camera.json in the pixels of an image; a calibration may be of larger ones.
-
-    Raises:
-        InputError: If the calibration is of pictures of another shape.
-    """
+    """The fields of camera.json in the pixels of an image of the same shape, if of another size."""
     own = at.maybe("w"), at.maybe("h")
     if size is None or None in own:
         return at
@@ -114,9 +110,7 @@ def _read_camera(path: Path, size: Size) -> At:
     if path.is_dir():
         files = (path / name for name in ("cameras.txt", "cameras.bin", "camera.json"))
         path = next((file for file in files if file.is_file()), path)
-    if not path.is_file():
-        raise InputError(f"{path}: {not_there(path)}, expected a camera")
-    match path.suffix.lower():
+    match existing(path, "a camera").suffix.lower():
         case ".json":
             return camera_of_tree(read_json(path), size)
         case ".xml" | ".yml" | ".yaml":

@@ -152,9 +152,8 @@ def shown(value: Any) -> str:  # noqa: ANN401
         return "nothing"
     if isinstance(value, np.ndarray):
         return f"shape {value.shape} of {value.dtype}"
-    if isinstance(value, Mapping):
-        keys = [str(key) for key in value]
-        return f"an object of {', '.join(keys[:6])[:60]}" if keys else "an empty object"
+    if isinstance(value, Mapping) and value:
+        return f"an object of {', '.join(map(str, value))[:60]}"
     if isinstance(value, int) and abs(value) > 10**18:
         return "a huge number"
     text = json.dumps(value) if isinstance(value, str) else repr(value)
@@ -180,7 +179,9 @@ def existing(path: Path, expected: str = "") -> Path:
     if not path.is_file():
         inner = path.parent / "room" / name  # of OUT of `mover video`
         more = f", but in {inner.parent}" if inner.is_file() else more
-        raise InputError(f"{name}: {not_there(path, f' in {path.parent}')}{more}")
+        raise InputError(
+            f"{name}: {not_there(path, f'there is no such file in {path.parent}')}{more}"
+        )
     if (size := path.stat().st_size) > LARGEST_FILE:
         raise InputError(f"{name}: has {size} bytes, expected at most {LARGEST_FILE}")
     return path
@@ -241,10 +242,7 @@ def is_amass(at: At) -> bool:
 
 
 def read_npz(path: Path, most: int = LARGEST_FILE) -> At:
-    """The arrays of an .npz file by name; one of objects or fields is `NotPlain`.
-
-    Of more than `most` bytes together nothing is unpacked.
-    """
+    """The arrays of an .npz file by name, of `most` bytes; odd ones are `NotPlain`."""
     name = existing(path, "an .npz file").name or path.resolve().name
     try:
         odd = _odd_arrays(path, most)
@@ -291,15 +289,14 @@ def read_npy(path: Path) -> At:
     Raises:
         InputError: If it is missing, broken, promises more than it has or holds pickled objects.
     """
-    if not path.is_file():
-        raise InputError(f"{path.name}: {not_there(path, f' in {path.parent}')}")
+    existing(path, "an .npy file")
     try:
         with path.open("rb") as file:
             dtype, size = _header(file)
             if dtype.hasobject or dtype.fields:
                 found = f"has {dtype}, expected plain numbers (no pickled objects)"
                 raise InputError(f"{path.name}: {found}")
-            if size > min(LARGEST_FILE, path.stat().st_size):
+            if size > path.stat().st_size:
                 found = f"promises {size} bytes, expected no more than it has"
                 raise InputError(f"{path.name}: {found}")
             file.seek(0)

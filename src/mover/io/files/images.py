@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mover.core.errors import InputError
-from mover.core.files import reason, replacing, special, unreadable
+from mover.core.files import not_there, reason, replacing, unreadable
 from mover.core.types import Camera, DepthImage
 from mover.io.files.fields import At, read_npy, read_npz
 from mover.io.files.meshes import inside
@@ -38,8 +38,7 @@ def opened(
 
     try:
         if not path.is_file():
-            what = special(path)
-            raise FileNotFoundError(f"it is {what}" if what else "there is no such file")
+            raise FileNotFoundError(f"it {not_there(path, 'does not exist')}")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             with Image.open(path) as picture:

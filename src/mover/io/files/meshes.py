@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
-from mover.core.files import copy_whole, instead, reason, replacing, special
+from mover.core.files import copy_whole, instead, not_there, reason, replacing
 from mover.core.types import Mesh, SeatStretch
 from mover.io.files.fields import LARGEST, LARGEST_FILE, At, shown
 
@@ -145,15 +145,13 @@ def check_gltf(at: At, path: Path, *, pictures: bool = False) -> None:
 def _check_trees(at: At, children: list[list[int]]) -> None:
     """Refuse nodes of several parents and nodes in a circle: glTF has trees."""
     parents = Counter(child for some in children for child in some)
-    for node, count in parents.most_common(1):
-        if count > 1:
-            at.refuse("one parent at most", f"{at.value!r}, whose node {node} has several parents")
+    if max(parents.values(), default=0) > 1:
+        at.refuse("trees of nodes", f"{at.value!r} with a node of several parents")
     reached = [node for node in range(len(children)) if node not in parents]
     for node in reached:  # grows
         reached.extend(children[node] if node >= 0 else ())
     if len(reached) < len(children):
-        lost = min({*range(len(children))}.difference(reached))
-        at.refuse("a tree of nodes", f"{at.value!r}, whose node {lost} is in or below a circle")
+        at.refuse("trees of nodes", f"{at.value!r} with nodes in a circle")
 
 
 def _uris(tree: Any) -> Iterator[tuple[str, dict[str, str], str]]:  # noqa: ANN401
@@ -365,10 +363,7 @@ def inside(at: At, folder: Path) -> Path:
         if not full.is_relative_to(folder.resolve()):
             at.refuse("a file inside the capture's folder", f"{name!r}, a link that leaves it")
         if not full.is_file():
-            what = special(full)
-            at.refuse(
-                "a file", f"{shown(name)}, which {f'is {what}' if what else 'does not exist'}"
-            )
+            at.refuse("a file", f"{shown(name)}, which {not_there(full, 'does not exist')}")
     except (OSError, RuntimeError) as error:  # names that are too long, links in a circle
         at.refuse("a file", f"{shown(name)}, which cannot be found ({reason(error)})")
     return full

@@ -155,9 +155,7 @@ def _of_folder(
         if file.suffix.lower() in FOREIGN:
             return read_instances(file, names, size)
     if not files:
-        raise InputError(
-            f"{path}: has no masks, expected pictures (.png), .npy, .npz or .json files"
-        )
+        raise InputError(f"{path}: has no masks, expected pictures (.png), .npy, .npz or .json")
     lone = people and len(files) == 1
     parts = [read_instances(f, names, size, people=lone, picture=picture) for f in files]
     many = [part.file for part in parts if len({item.frame for item in part.items}) > 1]

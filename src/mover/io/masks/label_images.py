@@ -260,12 +260,9 @@ def read_mask_arrays(path: Path, names: Names, *, people: bool = False) -> Insta
     at, notes = read_npz(path, LARGEST) if npz else read_any(path), list[str]()
     if isinstance(at.value, np.ndarray):
         at = at.holding({"masks": at.value})
-    match at.value:
-        case [{"pred_instances": _}, *_]:
-            found = "MMDetection's dump of a test ('pred_instances')"
-            at.refuse("masks: DetInferencer's preds/<image>.json (out_dir) has them", found)
-        case _:
-            pass
+    if isinstance(at.value, list) and "'pred_instances'" in str(at.value)[:1000]:
+        found = "MMDetection's dump of a test ('pred_instances')"
+        at.refuse("masks: DetInferencer's preds/<image>.json (out_dir) has them", found)
     at = at.maybe("video_segments") or at
     frames = [(key, at.get(key)) for key in at.mapping()]
     if frames and all(key.isdecimal() and isinstance(at.value, Mapping) for key, at in frames):
@@ -383,7 +380,7 @@ def _of_stack(at: At, stack: NDArray[Any], names: Names, *, people: bool) -> Ins
     if words is not None and isinstance(words.value, np.ndarray) and words.value.dtype.kind == "U":
         labels = [str(word) for word in words.array((rows,), "text")]
     shapes = (rows,), stack.shape[:2], (rows, 1)
-    if scores is not None and np.shape(scores.value) in shapes:
+    if scores and isinstance(scores.value, np.ndarray) and scores.value.shape in shapes:
         sure = np.clip(scores.array(scores.value.shape).reshape(-1), 0, 1)
 
     def row(i: int) -> Instance:
@@ -399,12 +396,10 @@ def _frames_first(at: At, stack: NDArray[Any], notes: list[str]) -> NDArray[Any]
     """A stack (frames, objects, h, w); of which axis frames are, ids say, else overlaps do."""
     a, b = stack.shape[:2]
     ids, turned = at.maybe(*TRACKS), np.swapaxes(stack, 0, 1)
-    known = a != b and ids is not None and np.size(ids.value) in (a, b)
-    other = np.size(ids.value) == a if ids and known else _overlap(turned) > _overlap(stack)
-    how = "(objects, frames, h, w)" if other else "(frames, objects, h, w)"
-    few, many = (a, b) if other else (b, a)
-    said = "" if known else ": they overlap from frame to frame"
-    notes.append(f"{at.file}: masks {how}, {few} people or things in {many} frames{said}")
+    count = 0 if ids is None or a == b else np.size(ids.value)
+    other = count == a if count in (a, b) else _overlap(turned) > _overlap(stack)
+    how, few, many = ("objects, frames", a, b) if other else ("frames, objects", b, a)
+    notes.append(f"{at.file}: masks ({how}, h, w): {few} people or things in {many} frames")
     return turned if other else stack
 
 

@@ -27,14 +27,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
-from mover.core.files import not_there
 from mover.core.types import Capture, Mesh
 from mover.geometry.rotations import affine
 from mover.io.capture.folder import build_capture
 from mover.io.capture.parts import Hints, Parts
 from mover.io.capture.scene_file import scene_tree
 from mover.io.files.cameras import GUESSED, read_camera_file, read_intrinsics, with_spread
-from mover.io.files.fields import At, listed, read_json
+from mover.io.files.fields import At, existing, listed, read_json
 from mover.io.files.images import image_size, read_image
 from mover.io.files.meshes import KINDS, is_cloud, load_parts, looks_lost, mesh_of, read_mesh
 from mover.io.files.schema import rotation
@@ -100,8 +99,7 @@ class TotalBox:
 
 def load_mat(path: Path) -> At:
     """The arrays of a MATLAB file, read in a process of its own."""
-    if not path.is_file():
-        raise InputError(f"{path.name}: {not_there(path, f' in {path.parent}')}")
+    existing(path)
     call = [sys.executable, "-P", "-c", READ, str(path.resolve())]
     done = subprocess.run(call, capture_output=True, check=False)
     said = pickle.loads(done.stdout) if done.returncode == 0 else "its reader died"
