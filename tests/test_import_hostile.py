@@ -286,7 +286,9 @@ def test_a_file_of_another_kind_is_named_by_what_it_is(what, ending, tmp_path):
 def test_a_zip_of_pictures_is_no_file_of_arrays(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
         archive.writestr("0.png", b"")
-    with pytest.raises(InputError, match=r"a.npz: is a zip archive with 0.png, expected an .npz"):
+    with pytest.raises(
+        InputError, match=r"a.npz: cannot be read .it is a zip archive with 0.png., expected an"
+    ):
         read_instances(tmp_path / "a.npz", {}, None)
 
 

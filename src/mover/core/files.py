@@ -37,7 +37,6 @@ KNOWN = {
     rb"PK\x03\x04|PK\x05\x06": ("it is a zip archive: unpack it", (".npz", *PICKLES)),
     rb"\x1f\x8b": ("it is packed by gzip: unpack it (gunzip)", PICKLES),
     rb"\x93NUMPY": ("it is an array of NumPy: call it .npy", (".npy", *PICKLES)),
-    rb"glTF": ("it is binary glTF: call it .glb", (".glb",)),
     rb'\s*(\{\s*["}]|\[\s*[]{])': ("it is JSON: call it .json", (".json", ".gltf")),
 }
 """The same of files whose names do not end as theirs do."""
@@ -79,9 +78,8 @@ def instead(path: Path) -> str:
     if path.is_file():
         with suppress(OSError), path.open("rb") as file:
             head, kind = file.read(64), path.suffix.lower()
-            others = {k: word for k, (word, own) in KNOWN.items() if kind not in own}
-            every = (INSTEAD | others).items()
-            return next((word for start, word in every if re.match(start, head, re.I)), "")
+            words = INSTEAD | {k: word for k, (word, own) in KNOWN.items() if kind not in own}
+            return next((w for start, w in words.items() if re.match(start, head, re.I)), "")
     return ""
 
 

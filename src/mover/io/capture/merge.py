@@ -276,10 +276,10 @@ def _check_apart(whole: Parts) -> Iterator[str]:
         groups += [(file, f"{d.category} ({d.id})", d.mask) for d in found if d.mask is not None]
     if camera is not None and whole.people is not None:
         people = people_of(whole.people, camera, ignored.append).people
-        for track in [] if people is None else people.person.unique().tolist():
-            rows = (people.person == track).nonzero()[:, 0].tolist()
-            few = replace(people.masks, counts=tuple(people.masks.counts[row] for row in rows))
-            groups.append((whole.people.file, f"person {track}", few))
+        if people is not None:
+            for track in people.person.unique().tolist():
+                few = rows_of(people, people.person == track).masks
+                groups.append((whole.people.file, f"person {track}", few))
     for file in dict.fromkeys(file for file, *_ in groups):
         masks = {name: masks for other, name, masks in groups if other == file}
         odd = [name for name, of_one in masks.items() if agree.bounded([of_one]).mean() < MOST]

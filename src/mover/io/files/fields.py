@@ -258,8 +258,7 @@ def _odd_arrays(path: Path, most: int) -> dict[str, NotPlain]:
     with zipfile.ZipFile(path) as archive:
         for entry in archive.infolist():
             if not entry.filename.endswith(".npy"):
-                found = f"is a zip archive with {entry.filename}"
-                raise InputError(f"{path.name}: {found}, expected an .npz file of arrays")
+                raise ValueError(f"it is a zip archive with {entry.filename}")
             with archive.open(entry) as stream:
                 dtype, size = _header(stream)
             total += size

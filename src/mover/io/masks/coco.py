@@ -121,8 +121,8 @@ def _runs(counts: Any, at: At) -> NDArray[np.int64]:  # noqa: ANN401
         return run_lengths(counts if isinstance(counts, bytes) else counts.encode("ascii"))
     except ValueError as error:
         coded = re.match(r"iVBOR|/9j/|data:image", str(counts))
-        found = "a picture in base64" if coded else f"counts with {error}"
-        at.refuse("COCO's compressed code", found)
+        found = f"counts with {error}"
+        at.refuse("COCO's compressed code", "a picture in base64" if coded else found)
 
 
 def _check_polygon(polygon: Any, reach: float, at: At, what: str) -> None:  # noqa: ANN401

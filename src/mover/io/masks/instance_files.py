@@ -441,10 +441,10 @@ def _of_mmdet(at: At, names: Names, size: Size | None) -> Instances:
     size = _size_of(mask) if (mask := next(drawn, None)) is not None else size
     rows = [row for k, one in enumerate(entries) for row in _predictions(one, k, names, size)]
     found = tuple(row for row in rows if row is not None)
-    few, note = len(rows) - len(found), f"{at.file}: detections with scores below {LEAST_SCORE}"
-    notes = (f"{note} left out: {few} of {len(rows)}",) if few else ()
-    if len(entries) > 1:
-        notes += (f"{at.file}: {len(entries)} entries of MMDetection are frames in their order",)
+    low = f"detections with scores below {LEAST_SCORE} left out: {rows.count(None)} of {len(rows)}"
+    several = f"{len(entries)} entries of MMDetection are frames in their order"
+    said = {low: len(rows) > len(found), several: len(entries) > 1}
+    notes = tuple(f"{at.file}: {text}" for text, holds in said.items() if holds)
     return Instances(found, size, at.file, frozenset(range(len(entries))), notes)
 
 

@@ -334,16 +334,13 @@ def _pasted(item: At, shape: ShapeFields, size: Size) -> bytes | None:
     x, y = (int(v) for v in shape.points[0])
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             png = io.BytesIO(base64.b64decode(shape.mask or "", validate=True))
             with Image.open(png, formats=["PNG"]) as picture:
                 if picture.width > width or picture.height > height:
                     item.get("mask").refuse("a mask no larger than the image", f"{picture.size}")
                 pixels = np.asarray(picture.convert("L")) > 0
-    except (
-        OSError, ValueError, SyntaxError, Image.DecompressionBombError,
-        Image.DecompressionBombWarning,
-    ):  # fmt: skip
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
         item.get("mask").refuse("a PNG in base64", "what cannot be read")
     whole = np.zeros((height, width), dtype=bool)
     part = pixels[: height - y, : width - x]

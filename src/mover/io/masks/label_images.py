@@ -99,8 +99,8 @@ def _things_and_frames(paths: Sequence[Path], source: Path) -> tuple[list[str], 
         said = f"names like {stems[0]} are of a frame and of a person or thing in it"
         return [pair[2] for pair in found], framed, said
     short, long = (min(len(re.sub(r"\D", "", s)) for s in some) for some in (stems, folders))
-    more = len(set(folders)) > len(set(stems))
-    if not _are_frames(folders) or len(set(stems)) == len(stems) or (long, more) < (short, True):
+    objects = (long, len(set(folders))) <= (short, len(set(stems)))
+    if objects or not _are_frames(folders) or len(set(stems)) == len(stems):
         return folders, stems, ""
     return stems, folders, f"folders like {folders[0]} are frames, with the people or things in it"
 
@@ -274,9 +274,7 @@ def read_mask_arrays(path: Path, names: Names, *, people: bool = False) -> Insta
     given = at.maybe(*MASKS)
     if given is None:
         at.refuse(f"an array named {', '.join(MASKS)}", ", ".join(sorted(at.value)[:6]) or "none")
-    stack = _cut(given, _stack_of(given), notes)
-    if stack.ndim == 4 and 1 not in stack.shape[:2]:
-        stack = _frames_first(at, stack, notes)
+    stack = _stack_of(at, given, notes)
     flat, size = stack.reshape(-1, *stack.shape[-2:]), (stack.shape[-1], stack.shape[-2])
     if stack.dtype == np.bool_ or (stack.ndim > 2 and not _are_maps(stack)):
         found = _of_stack(at, stack, names, people=people)
@@ -291,13 +289,17 @@ def read_mask_arrays(path: Path, names: Names, *, people: bool = False) -> Insta
     return replace(_gathered(rows, at.file, "masks", () if stack.ndim == 2 else numbers), size=size)
 
 
-def _stack_of(at: At) -> NDArray[Any]:
-    """An array of masks or labels, the picture's axes behind."""
-    stack = at.value
+def _stack_of(at: At, given: At, notes: list[str]) -> NDArray[Any]:
+    """Masks or labels, cut: those of frames first, then of objects, the picture's axes behind."""
+    stack = given.value
     known = isinstance(stack, np.ndarray) and stack.dtype.kind in "buif" and stack.size
     if not known or not 2 <= stack.ndim <= 4:
-        at.refuse("an array of masks (n, h, w), (frames, objects, h, w) or labels (h, w)")
-    return np.moveaxis(stack, -1, 1) if stack.ndim == 4 and stack.shape[-1] == 1 else stack
+        given.refuse("an array of masks (n, h, w), (frames, objects, h, w) or labels (h, w)")
+    if stack.ndim == 4 and stack.shape[-1] == 1:
+        stack = np.moveaxis(stack, -1, 1)  # (frames, h, w, 1)
+    several = stack.ndim == 4 and 1 not in stack.shape[:2]
+    stack = _cut(given, stack, notes)
+    return _frames_first(at, stack, notes) if several else stack
 
 
 def _cut(at: At, value: NDArray[Any], notes: list[str]) -> NDArray[Any]:

@@ -309,8 +309,7 @@ def _things(folder: Path) -> tuple[list[Path], list[str]]:
     meshes = [path for path in paths if path not in clouds]
     once = {path.stem: path for path in reversed(meshes)}  # the first of each name
     if not once:
-        passed = [path.name for path in clouds]
-        found = f"{listed('file', passed)} of points or splats, " if clouds else ""
+        found = f"{listed('file', [p.name for p in clouds])} of splats, " if clouds else ""
         wanted = "expected <name>.glb with <name>.npz or .json"
         raise InputError(f"{folder}: has {found}no meshes, {wanted}")
     posed = {p for p in once.values() if any(p.with_suffix(kind).is_file() for kind in TREES)}
