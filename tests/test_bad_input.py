@@ -95,7 +95,7 @@ JSON = [
     ("objects.json", "annotations.0.segmentation", SQUARE, r"size \[10, 10\], expected \[48, 64\]"),
     ("objects.json", "annotations.0.segmentation.counts", [5], "sum to"),
     ("objects.json", "annotations.0.segmentation.counts", [48 * 64], "an empty mask"),
-    ("objects.json", "annotations.1.segmentation.0", [1, 1, 2, 2], "4 items"),
+    ("objects.json", "annotations.1.segmentation.0", [1, 1, 2, 2], "4 numbers"),
     ("objects.json", "annotations.1.segmentation.0", [1, 1, 1, 1, 1, 1], "an empty mask"),
     ("people.json", "info.fps", 0, "'info.fps' has 0"),
     ("people.json", "info.heights", {"0": 178}, "'info.heights.0' has 178"),

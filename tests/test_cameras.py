@@ -349,6 +349,29 @@ def test_every_calibration_gives_the_same_lens(kind, tmp_path):
         assert read_camera_file(tmp_path, None).value == found
 
 
+OWN = {"w": 960, "h": 540, "fl_x": FX, "fl_y": FY, "cx": CX + 0.5, "cy": CY + 0.5}
+FOUR = {"fx": FX, "fy": FY, "cx": CX, "cy": CY}
+SIZED = LENSES | {
+    "our own": ("camera.json", OWN),
+    "K": ("k.json", {**SIDES, "K": np.ravel(K).tolist()}),
+    "four numbers inside": ("n.json", {**SIDES, "intrinsics": FOUR}),
+}
+
+
+@pytest.mark.parametrize("kind", SIZED)
+def test_a_lens_of_another_size_is_scaled_or_refused_with_both_sizes(kind, tmp_path, caplog):
+    path = written(tmp_path, *SIZED[kind])
+    assert read_camera_file(path, (960, 540)).value.items() >= OWN.items()
+    found = read_camera_file(path, (480, 270)).value
+    assert found.items() >= {name: value / 2 for name, value in OWN.items()}.items()
+    said = "is of pictures of 960 x 540 pixels"
+    assert caplog.messages[-1] == f"{path.name}: {said}; it is scaled to the image of 480 x 270"
+    for size in ((960, 720), (540, 960)):
+        wanted = f"expected the shape of the image, {size[0]} x {size[1]}"
+        with pytest.raises(InputError, match=f"^{re.escape(path.name)}: {said}, {wanted}"):
+            read_camera_file(path, size)
+
+
 POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n"
 NO_LENSES: dict[str, tuple[str, str | bytes | dict[str, Any], str]] = {
     "bent": ("c.yml", YAML.replace("1e-04", "-0.3"), "corners by .* undistort the images"),

@@ -109,7 +109,8 @@ def test_masks_without_names_and_files_without_people_are_said(tmp_path: Path) -
     with pytest.raises(InputError, match="no people, only name 'chair', expected masks of people"):
         read_people(tmp_path / "m.npz", {}, SIZE)
     np.savez(tmp_path / "n.npz", masks=mask[None])
-    assert any("no category: --names" in n for n in read_things(tmp_path / "n.npz", {}, SIZE).notes)
+    said = "n.npz: masks without category: 1 of 1 (--names 1=chair)"
+    assert said in read_things(tmp_path / "n.npz", {}, SIZE).notes
 
 
 @pytest.mark.parametrize(("data", "words"), [(HEIC, "HEIC"), (b"hello", "no picture that can be")])

@@ -153,6 +153,41 @@ def test_frames_keep_their_numbers_over_gaps_and_a_person_is_one_track(way, tmp_
         assert off <= (0.15 if "soft" in way or "jpg" in way else 0)
 
 
+BOTH = {  # how pictures of two in each frame are called, and what is said of it
+    "00000/0.png": ("{0:05d}/{1}.png", "folders like 00000 are frames"),
+    "frame_0001/person_1.png": ("frame_{0:04d}/person_{1}.png", "folders like frame_0000 are"),
+    "0/0.png": ("{0}/{1}.png", "folders like 0 are frames"),
+    "00000_0.png": ("{0:05d}_{1}.png", "names like 00000_0 are of a frame and of a person"),
+    "frame_000-obj1.png": ("frame_{0:03d}-obj{1}.png", "names like frame_000-obj0 are of a frame"),
+    "001/00000.png": ("{1:03d}/{0:05d}.png", ""), "1/00000.png": ("{1}/{0:05d}.png", ""),
+    "person_1/0.png": ("person_{1}/{0}.png", ""), "p_001/0.png": ("p_{1:03d}/{0}.png", ""),
+    "00001/00000.png": ("{1:05d}/{0:05d}.png", ""),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("way", BOTH)
+def test_names_and_folders_are_those_of_frames_or_of_people(way, tmp_path):
+    name, said = BOTH[way]
+    wanted = {(k, t): walker(k, 4 + 28 * t) for k in KEPT for t in (0, 1) if (k, t) != (2, 1)}
+    for (frame, track), mask in wanted.items():
+        path = tmp_path / "in" / name.format(frame, track)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        white(mask).save(path)
+    found = read_people(tmp_path / "in", {}, None)
+    got = pixels(found)
+    assert got.keys() == wanted.keys()
+    assert all((got[key] == mask).all() for key, mask in wanted.items())
+    assert said in "; ".join(found.notes)
+    assert bool(said) == any("like" in note for note in found.notes)
+
+
+def test_things_that_are_numbered_twice_are_things_of_one_picture(tmp_path):
+    for number in (0, 1):
+        white(walker(0, 4 + 28 * number)).save(tmp_path / f"chair_001_{number}.png")
+    found = read_things(tmp_path, {}, None)
+    assert [(i.category, i.frame, i.track) for i in found.items] == [("chair", 0, None)] * 2
+
+
 @pytest.mark.parametrize("boxes", [True, False])
 def test_people_without_tracks_are_followed_by_place_not_by_score(boxes, tmp_path):
     """The one with the better score alternates, and so does their order (k34)."""
@@ -189,6 +224,22 @@ def test_a_stack_of_frames_is_a_person_and_one_of_apart_masks_are_people(tmp_pat
     found = read_people(tmp_path / "people.npy", {}, None)
     assert list(pixels(found)) == [(0, 0), (0, 1), (0, 2)]
     assert any("3 masks are people of one image" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("shape", ["objects first", "frames first"])
+@pytest.mark.parametrize("count", [2, 6, 9])
+def test_the_axis_of_frames_is_that_along_which_masks_overlap(shape, count, tmp_path):
+    two = np.stack([[walker(k, 4 + 28 * t) for t in (0, 1)] for k in range(count)])
+    stack = two if shape == "frames first" else two.swapaxes(0, 1)
+    axes = "(frames, objects, h, w)" if shape == "frames first" else "(objects, frames, h, w)"
+    for name, more in (("a", {}), ("b", {"object_ids": np.arange(2)})):
+        np.savez(tmp_path / f"{name}.npz", masks=stack, **more)
+        found = read_people(tmp_path / f"{name}.npz", {}, None)
+        said = f"{name}.npz: masks {axes}: 2 people or things in {count} frames"
+        assert said in found.notes
+        got = pixels(found)
+        assert got.keys() == {(k, t) for k in range(count) for t in (0, 1)}
+        assert all((mask == two[key]).all() for key, mask in got.items())
 
 
 @pytest.mark.parametrize("apart", [False, True])
@@ -248,7 +299,7 @@ def test_soft_labels_are_labels_and_a_dancer_is_a_person(tmp_path):
     assert any("'dancer' taken as people's" in note for note in people.notes)
     del rows[0]["mask"]
     boxes = read_people(save(tmp_path, rows), {}, None)
-    assert "a.json: 1 boxes have no mask, which people need: left out" in boxes.notes
+    assert "a.json: boxes without mask, which people need, left out: 1" in boxes.notes
 
 
 def grounded(folder: Path) -> Path:
@@ -262,10 +313,57 @@ def grounded(folder: Path) -> Path:
 
 def mmdet(folder: Path) -> Path:
     """outputs/preds/a.json of mmdet's DetInferencer (mmdet/apis/det_inferencer.py: pred2dict)."""
-    tree = {"labels": [56, 0, 60], "scores": [0.9, 0.8, 0.05],
+    return save(folder, predictions(0))
+
+
+def predictions(frame: int) -> dict[str, Any]:
+    return {"labels": [56, 0, 60], "scores": [0.9, 0.8, 0.05],
             "bboxes": [[4, 10, 18, 40], [0, 0, 9, 9], [0, 0, 5, 5]],
-            "masks": [code(walker(0)), code(walker(3, 30)), code(walker(0, 9))]}  # fmt: skip
-    return save(folder, tree)
+            "masks": [code(walker(0)), code(walker(frame, 30)), code(walker(0, 9))]}  # fmt: skip
+
+
+FRAMES = [predictions(frame) for frame in range(4)]
+
+
+@pytest.mark.parametrize("tree", [
+    FRAMES, {"predictions": FRAMES, "visualization": []}, [{"predictions": [p]} for p in FRAMES],
+])  # fmt: skip
+def test_entries_of_mmdetection_are_frames(tree, tmp_path):
+    path = save(tmp_path, tree)
+    found = read_people(path, {}, None)
+    got = pixels(found)
+    assert list(got) == [(k, 0) for k in range(4)]
+    assert all((mask == walker(k, 30)).all() for (k, _), mask in got.items())
+    assert "a.json: 4 entries of MMDetection are frames in their order" in found.notes
+    (chair_of_2,) = read_things(path, {}, None, "000002.png").items
+    assert (chair_of_2.category, chair_of_2.frame) == ("chair", 2)
+
+
+def test_a_list_of_other_objects_is_named_by_their_fields(tmp_path):
+    path = save(tmp_path, [{"boxes": [[0, 0, 9, 9]], "ids": [1]}])
+    with pytest.raises(InputError, match=r"'\[0\]' has an object of boxes, ids, expected a detec"):
+        read_things(path, {}, None)
+
+
+@pytest.mark.parametrize("kind", ["masks", "labels"])
+def test_a_folder_of_arrays_has_an_array_a_frame(kind, tmp_path):
+    for frame in KEPT:
+        both = np.stack([walker(frame, 34), walker(frame)])
+        if kind == "labels":
+            np.savez(tmp_path / f"mask_{frame:05d}.npz", masks=both[0] * 2 + both[1] * 5)
+        else:
+            ids = np.array([2, 5])
+            np.savez(tmp_path / f"mask_{frame:05d}.npz", masks=both, object_ids=ids)
+    got = pixels(read_people(tmp_path, {}, None))
+    assert got.keys() == {(k, t) for k in KEPT for t in (2, 5)}
+    assert all((mask == walker(k, 34 if t == 2 else 4)).all() for (k, t), mask in got.items())
+    np.savez(tmp_path / "mask_00009.npz", masks=np.stack([walker(k) * 3 for k in range(3)]),
+             frame=np.arange(3))  # fmt: skip
+    with pytest.raises(InputError, match=r"6 files, of which mask_00009.npz has several frames"):
+        read_people(tmp_path, {}, None)
+    for path in tmp_path.glob("mask_0000[0-8].npz"):
+        path.unlink()
+    assert list(pixels(read_people(tmp_path, {}, None))) == [(k, 0) for k in range(3)]
 
 
 @pytest.mark.parametrize("write", [grounded, mmdet])
@@ -298,11 +396,19 @@ def test_of_many_images_only_ours_counts_and_this_is_said(tmp_path):
         read_things(path, {}, (W, H), "x.png")
 
 
-def chair(folder: Path, drawn: Any, **more: Any) -> Instances:
+def chair(folder: Path, drawn: Any, *, file: str = "", **more: Any) -> Instances:
     row = {"id": 1, "image_id": 0, "category_id": 1, "segmentation": drawn, **more}
-    tree = {"images": [{"id": 0, "width": W, "height": H}], "annotations": [row],
-            "categories": [{"id": 1, "name": "chair"}]}  # fmt: skip
-    return read_things(save(folder, tree), {}, None)
+    image = {"id": 0, "width": W, "height": H, "file_name": file}
+    tree = {"images": [image], "annotations": [row], "categories": [{"id": 1, "name": "chair"}]}
+    return read_things(save(folder, tree), {}, None, "room.png")
+
+
+@pytest.mark.parametrize("file", ["", "images/Room.JPG", "other.jpg"])
+def test_a_lone_image_of_another_name_is_taken_and_this_is_said(file, tmp_path):
+    found = chair(tmp_path, [SQUARE], file=file)
+    said = f"a.json: its only image, {file}, is taken for room.png"
+    assert found.notes == ((said,) if file == "other.jpg" else ())
+    assert [item.category for item in found.items] == ["chair"]
 
 
 @pytest.mark.parametrize("nothing", [[], [[]], None])
@@ -315,10 +421,23 @@ SQUARE = [[4, 10], [18, 10], [18, 40], [4, 40]]
 TEXT = {"size": f"[{H}, {W}]", "counts": compressed(runs(walker(0)))}
 
 
-@pytest.mark.parametrize("drawn", [[SQUARE], [SQUARE, []], TEXT])
+COUNTS = {"size": [H, W], "counts": str(runs(walker(0)))}
+
+
+@pytest.mark.parametrize("drawn", [[SQUARE], [SQUARE, []], TEXT, COUNTS])
 def test_other_spellings_of_a_mask_are_the_same_mask(drawn, tmp_path):
     (mask,) = pixels(chair(tmp_path, drawn)).values()
     assert (mask == walker(0)).all()
+
+
+@pytest.mark.parametrize(("drawn", "words"), [
+    ([[4, 10, 18, 10, 18, 40, 4]], "has polygon 0 with 7 numbers, an odd count, expected numbers"),
+    ("iVBORw0KGgoAAAANSUhEUgAAAA/z=", "has a picture in base64, expected COCO's compressed code"),
+    ({"size": [H, W], "counts": "data:image/png;base64,iVBO"}, "has a picture in base64"),
+])  # fmt: skip
+def test_what_is_no_mask_is_named(drawn, words, tmp_path):
+    with pytest.raises(InputError, match=rf"segmentation' {words}"):
+        chair(tmp_path, drawn)
 
 
 def test_a_track_of_cvat_is_an_attribute(tmp_path):

@@ -121,14 +121,18 @@ def test_another_piece_of_the_class_is_another_shape(name: str, seed: int) -> No
 
 
 WORDS = {
-    "chair": "Chair, chairs, SM_Chair_02, chair (2), chair_left, Dining Chair, СТУЛ, Chair_A",
-    "armchair": "Armchair01, recliner, rocking chair, Sofa_Chair, Lounge Chair / Cafe Chair",
+    "chair": "Chair, chairs, SM_Chair_02, chair (2), chair_left, Dining Chair, СТУЛ, Chair_A, "
+    "Stühle, Stu\u0308hle_01, seat, silla, sillas",
+    "armchair": "Armchair01, recliner, rocking chair, Sofa_Chair, Lounge Chair / Cafe Chair, "
+    "Sessel_gross",
     "office chair": "swivel-chair, OfficeChair, SM_Chair_Office_01, Bu\u0308rostuhl",
     "stool": "Ottoman, Footstool / Sofastool / Bed End Stool / Stool",
     "bar stool": "bar stool, BarStool.001, Barstools, counter stool",
-    "sofa": "Couch, Couches, sofa bed, Studio couch, Three-Seat / Multi-seat Sofa, L-shaped Sofa",
+    "sofa": "Couch, Couches, sofa bed, Studio couch, Three-Seat / Multi-seat Sofa, L-shaped Sofa, "
+    "sofa_3seater, 3-seater sofa, Sofa-2-Sitzer",
     "bed": "bed, King-size Bed, bunk_bed, Betten / Bett",
-    "table": "dining table, dining-table, DiningTable, Kitchen & dining room table, стол",
+    "table": "dining table, dining-table, DiningTable, Kitchen & dining room table, стол, "
+    "Tisch_rund, Tische, mesa",
     "desk": "Dressing Table, Schreibtisch, office_desk",
     "coffee table": "endtable, End_Table, Table_Coffee, Corner/Side Table, Tea Table",
     "shelf": "BOOKSHELF, bookcase, shelves, bookshelves, Bookcase / jewelry Armoire",
@@ -136,6 +140,7 @@ WORDS = {
     "nightstand": "night_stand, Nightstand, bedside table", "floor lamp": "lamp, floor_lamp_1",
     "bench": "Benches, piano bench", "wardrobe": "closet, Kleiderschrank",
     "table lamp": "table_lamp", "potted plant": "Potted Plants", "dog bed": "DogBed",
+    "toilet": "toilet seat",
     "object": "object, Object_3", "sextant": "Sextant", "12": "12",
 }  # fmt: skip
 """Names of COCO, ADE20K, ScanNet, SUN RGB-D, 3D-FRONT, Open Images, of files and of people."""

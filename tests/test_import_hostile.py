@@ -1,6 +1,8 @@
 """Whatever a source holds: it is imported or refused with a message; nothing in it runs."""
 
 import json
+import os
+import re
 import shutil
 import tempfile
 import zipfile
@@ -14,12 +16,16 @@ import tiny_capture as tiny
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from kept_mats import mats_read_once as mats_read_once  # for every test
+from PIL import Image
 from test_safe_pickle import Calls
 
+from mover.app.cli.video import VideoArgs, video_to_room
 from mover.core.errors import InputError
 from mover.io.capture.merge import import_into
 from mover.io.capture.parts import Hints
+from mover.io.files.cameras import read_camera_file
 from mover.io.files.fields import At
+from mover.io.files.meshes import read_mesh
 from mover.io.formats import IMPORTED, chosen
 from mover.io.masks.instance_files import read_instances
 
@@ -211,6 +217,98 @@ def test_a_gltf_cannot_bring_other_files_along(tmp_path):
         chosen("FORMAT", "glb", *IMPORTED)(path, Hints(work=tmp_path))
 
 
+PIPED = ["a.npy", "a.npz", "a.json", "a.png", "a.pkl"]
+
+
+@pytest.mark.parametrize("name", PIPED)
+def test_a_pipe_a_device_and_a_folder_are_no_files(name, tmp_path):
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(InputError, match=rf"^{name}: .*is no file \(a pipe\)"):
+        read_instances(tmp_path / name, {}, None)
+    with pytest.raises(InputError, match=rf"{name}: .*is no file \(a pipe\)"):
+        read_camera_file(tmp_path / name, None)
+    (tmp_path / name).unlink()
+    (tmp_path / name).symlink_to("/dev/null")
+    with pytest.raises(InputError, match=rf"^{name}: .*is no file \(a device\)"):
+        read_instances(tmp_path / name, {}, None)
+    with pytest.raises(InputError, match=rf"{name}: is no file \(a device\), expected a video or"):
+        video_to_room(VideoArgs(tmp_path / name, out=tmp_path / "out"))
+    (tmp_path / "m.glb").mkdir()
+    with pytest.raises(
+        InputError, match=r"objects\.mesh' has .m\.glb., which is no file .a folder., expected"
+    ):
+        read_mesh(At("m.glb", "scene.json", "objects.mesh"), tmp_path)
+
+
+@pytest.mark.parametrize(("size", "said"), [
+    ((13000, 13000), "13000 x 13000 pixels"), ((20000, 10000), "200000000 pixels"),
+])  # fmt: skip
+def test_a_picture_of_too_many_pixels_says_so(size, said, tmp_path):
+    Image.new("1", size).save(tmp_path / "a.png")
+    with pytest.raises(InputError, match=rf"^a.png: .*too large: {said}, at most \d+ are read"):
+        read_instances(tmp_path / "a.png", {}, None)
+
+
+def test_masks_of_more_than_two_gigabytes_are_refused_by_their_header(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("masks.npy", layouts.promise(1000, 600, 600))
+    with pytest.raises(InputError, match=r"'masks' has 2880000000 bytes or more, expected at most"):
+        read_instances(tmp_path / "a.npz", {}, None)
+
+
+OTHERS = {
+    "a zip archive": (b"PK\x05\x06" + b"\0" * 18, "it is a zip archive: unpack it"),
+    "gzip": (b"\x1f\x8b\x08" + b"\0" * 20, r"it is packed by gzip: unpack it \(gunzip\)"),
+    "JSON": (b'{"a": 1}', "it is JSON: call it .json"),
+    "an array": (layouts.promise(2, 3), "it is an array of NumPy: call it .npy"),
+    "junk": (b"\x07hello there\n", ""),
+}
+OWN_ENDS = {"a zip archive": ("npz",), "JSON": ("json",), "an array": ("npy",)}
+
+
+@pytest.mark.parametrize("what", OTHERS)
+@pytest.mark.parametrize(
+    "ending", ["npy", "npz", "json", "png", "glb", "gltf", "ply", "stl", "off"]
+)
+def test_a_file_of_another_kind_is_named_by_what_it_is(what, ending, tmp_path):
+    content, words = OTHERS[what]
+    path = tmp_path / f"a.{ending}"
+    path.write_bytes(content)
+    is_masks, mesh = ending in ("npy", "npz", "json", "png"), At(path.name, "scene.json", "mesh")
+    with pytest.raises(InputError, match=rf"a\.{ending}") as caught:
+        _ = read_instances(path, {}, None) if is_masks else read_mesh(mesh, tmp_path)
+    own = ending in OWN_ENDS.get(what, ()) or (what, ending) == ("JSON", "gltf")
+    assert own or re.search(words, str(caught.value))
+    pythons = r"magic|Expecting|reading|Not a ply|zip file|UTF-8|char 0|Error|\[\]"
+    assert not re.search(pythons, str(caught.value))
+
+
+def test_a_zip_of_pictures_is_no_file_of_arrays(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("0.png", b"")
+    with pytest.raises(
+        InputError, match=r"a.npz: cannot be read .it is a zip archive with 0.png., expected an"
+    ):
+        read_instances(tmp_path / "a.npz", {}, None)
+
+
+@pytest.mark.parametrize(("children", "words"), [
+    ({0: [0]}, "with nodes in a circle, expected trees of nodes"),
+    ({0: [1], 1: [0]}, "with nodes in a circle, expected trees of nodes"),
+    ({0: [1], 2: [1]}, "with a node of several parents, expected trees of nodes"),
+])  # fmt: skip
+def test_a_gltf_whose_nodes_are_no_trees_is_refused(children, words, tmp_path):
+    path = layouts.write_glb(tmp_path / "in" / "a.glb", little())
+
+    def change(tree):
+        tree["nodes"] = [{**node, "children": children.get(k, [])}
+                         for k, node in enumerate(tree["nodes"])]  # fmt: skip
+
+    path.write_bytes(layouts.with_json(path.read_bytes(), change))
+    with pytest.raises(InputError, match=rf"a\.glb.*{words}"):
+        chosen("FORMAT", "glb", *IMPORTED)(path, Hints(work=tmp_path))
+
+
 @pytest.mark.parametrize("wrong", [{"yfov": 0}, {"aspectRatio": 0}, {"yfov": float("inf")}])
 def test_a_camera_of_a_gltf_without_an_angle_is_refused(tmp_path, wrong):
     path = layouts.write_glb(tmp_path / "in" / "a.glb", little())
@@ -224,8 +322,6 @@ def test_a_camera_of_a_gltf_without_an_angle_is_refused(tmp_path, wrong):
 
 
 def test_xml_bombs_are_refused(tmp_path):
-    from mover.io.files.cameras import read_camera_file
-
     path = tmp_path / "a.xml"
     path.write_text('<!DOCTYPE x [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]><x>&b;</x>')
     with pytest.raises(InputError, match="entities"):

@@ -77,7 +77,7 @@ def test_shapes_of_labelme_are_filled_and_those_of_a_group_are_one(tmp_path):
     ]
     found = read_instances(layouts.write_labelme(tmp_path / "a.json", shapes), {}, None)
     assert found.size == (64, 48)
-    assert found.notes == ("a.json: 1 shapes of points or lines are passed over",)
+    assert found.notes == ("a.json: shapes of points or lines passed over: 1",)
     assert [item.category for item in found.items] == ["chair", "lamp", "chair"]
     truth = np.zeros((3, 48, 64), dtype=bool)
     truth[0, 10:25, 10:30] = truth[0, 10:14, 40:44] = True
@@ -297,6 +297,25 @@ def test_masks_alone_make_a_part_and_what_is_missing_is_said(tmp_path, capsys):
     new, picture_of = tmp_path / "new", picture(tmp_path / "a.png", (64, 48))
     run_import(ImportArgs("folder", new, new, image=picture_of))  # a capture that is started
     assert (new / "reference.png").is_file()
+
+
+@pytest.mark.parametrize("wrong", [(1,), (0, 1, 2, 3)])
+def test_each_mask_that_is_inverted_is_named(wrong, tmp_path, capsys):
+    masks = drawn()
+    masks[list(wrong)] ^= True
+    files = layouts.write_masks(tmp_path / "in", masks, ["chair", "couch"] * 2)
+    picture_of = picture(tmp_path / "a.png", (64, 48))
+    people = tmp_path / "people.npz"
+    video = np.repeat(masks[:2], 3, axis=0).reshape(2, 3, 48, 64)
+    np.savez(people, masks=video.swapaxes(0, 1), object_ids=np.array([4, 9]))
+    run_import(ImportArgs("masks", files["coco_text"], tmp_path / "out", image=picture_of, fov=60.0,
+                          people_masks=people))  # fmt: skip
+    said = capsys.readouterr().out
+    names = [f"{('chair', 'couch')[i % 2]} ({i})" for i in wrong]
+    assert f"masks fill the picture to its borders, inverted? {', '.join(names)}\n" in said
+    names = [f"person {(4, 9)[i]}" for i in wrong if i < 2]
+    known = "people.npz: masks fill the picture to its borders, inverted?"
+    assert f"{known} {', '.join(names)}\n" in said
 
 
 def test_nothing_is_written_when_a_part_does_not_fit_or_there_is_none(plain, tmp_path):

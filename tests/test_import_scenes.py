@@ -239,6 +239,13 @@ def test_a_scene_needs_a_camera_and_a_mesh_a_pose(plain, tmp_path):
         imported("glb", source, tmp_path / "out", tmp_path)
     assert not (tmp_path / "out").exists()
     source = layouts.write_sam3d(tmp_path / "in", plain)
+    (source / "scene.obj").write_text("version https://git-lfs.github.com/spec/v1\noid 1\n")
     (source / "1.npz").unlink()
-    with pytest.raises(InputError, match=r"1\.npz or 1\.json"):
+    found = imported("sam3d", source, tmp_path / "out", tmp_path, camera=camera_at(plain))
+    said = "2 files (1.glb, scene.obj) without a pose (.npz or .json) beside it: passed over"
+    assert said in found.notes
+    assert len(found.capture.scene.objects) == len(plain.things) - 1
+    for pose in (source / "scene.obj", *source.glob("*.npz")):
+        pose.unlink()
+    with pytest.raises(InputError, match=r"0\.glb: has no pose, expected 0\.npz or 0\.json"):
         imported("sam3d", source, tmp_path / "out", tmp_path, camera=camera_at(plain))

@@ -32,6 +32,16 @@ INSTEAD = {
     rb"\Z": "it is empty: copy or download it again",
 }
 """What a file may be instead of what was expected, by its first bytes."""
+PICKLES = (".pt", ".pth", ".pkl", ".pickle", ".joblib")
+KNOWN = {
+    rb"PK\x03\x04|PK\x05\x06": ("it is a zip archive: unpack it", (".npz", *PICKLES)),
+    rb"\x1f\x8b": ("it is packed by gzip: unpack it (gunzip)", PICKLES),
+    rb"\x93NUMPY": ("it is an array of NumPy: call it .npy", (".npy", *PICKLES)),
+    rb'\s*(\{\s*["}]|\[\s*[]{])': ("it is JSON: call it .json", (".json", ".gltf")),
+}
+"""The same of files whose names do not end as theirs do."""
+OTHER_WORDS = r"magic string|Not a ply file|Expecting value: line 1 column 1 "
+"""What parsers say of a file that is of another kind."""
 
 
 @contextmanager
@@ -67,9 +77,19 @@ def instead(path: Path) -> str:
     """What a file is in place of what was expected; empty: nothing that is known."""
     if path.is_file():
         with suppress(OSError), path.open("rb") as file:
-            head = file.read(64)
-            return next((w for start, w in INSTEAD.items() if re.match(start, head, re.I)), "")
+            head, kind = file.read(64), path.suffix.lower()
+            words = INSTEAD | {k: word for k, (word, own) in KNOWN.items() if kind not in own}
+            return next((w for start, w in words.items() if re.match(start, head, re.I)), "")
     return ""
+
+
+def not_there(path: Path, missing: str = "there is no such file") -> str:
+    """What to say of a path that is no file: a pipe is there, or nothing."""
+    kinds = {
+        "a folder": path.is_dir(), "a pipe": path.is_fifo(), "a socket": path.is_socket(),
+        "a device": path.is_char_device() or path.is_block_device(),
+    }  # fmt: skip
+    return next((f"is no file ({kind})" for kind, there in kinds.items() if there), missing)
 
 
 def reason(error: Exception, path: Path | None = None) -> str:
@@ -80,10 +100,12 @@ def reason(error: Exception, path: Path | None = None) -> str:
         return "it is no text in UTF-8: save it as UTF-8"
     if "cannot identify image file" in str(error):
         return "it is no picture that can be opened, such as JPEG or PNG"
+    if large := re.match(r"Image size \((\d+) pixels\) exceeds limit of (\d+)", str(error)):
+        return f"it is too large: {large[1]} pixels, at most {large[2]} are read"
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     spoken = isinstance(error, ValueError | RuntimeError | SyntaxError | OSError) or path is None
-    if spoken and str(error):
+    if spoken and str(error) and not re.search(OTHER_WORDS, str(error)):
         return " ".join(str(error).split())[:160]
     return "it is damaged, cut off or of another kind"
 

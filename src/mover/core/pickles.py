@@ -23,7 +23,7 @@ import numpy as np
 import torch
 
 from mover.core.errors import InputError
-from mover.core.files import BROKEN, unreadable
+from mover.core.files import BROKEN, not_there, unreadable
 
 LARGEST = 2 << 30  # of a file, of an array, of the tree that a file unfolds to [bytes]
 REPEATED = 1 << 26  # of a tensor that repeats its numbers [bytes]
@@ -64,7 +64,7 @@ def load_plain(path: Path) -> Any:  # noqa: ANN401
     """
     name = path.name
     if not path.is_file():
-        raise InputError(f"{name}: there is no such file in {path.parent}, expected a pickle")
+        raise InputError(f"{name}: {not_there(path)}, expected a pickle")
     try:
         if path.stat().st_size > LARGEST:
             raise InputError(f"has {path.stat().st_size} bytes, expected at most {LARGEST}")
@@ -135,7 +135,7 @@ def load_weights(path: Path, field: str, expected: str) -> dict[str, torch.Tenso
         InputError: If the file is missing or broken, or holds no tensors by name.
     """
     if not path.is_file():
-        raise InputError(f"{path}: there is no such file, expected {expected}")
+        raise InputError(f"{path}: {not_there(path)}, expected {expected}")
     try:
         tree = _of_torch(path.read_bytes())
     except InputError as error:

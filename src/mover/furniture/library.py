@@ -124,36 +124,36 @@ OTHER_NAMES: dict[str, str] = {
     "futon, sofa bed, sleeper sofa, daybed, day bed, divan, chaise, chaise longue, "
     "chaise lounge, lounge, диван, тахта, schlafsofa, ecksofa",
     "bed": "single bed, double bed, bunk bed, loft bed, bed frame, bedframe, кровать, bett, "
-    "doppelbett",
+    "doppelbett, cama",
     "table": "dining table, kitchen table, round table, console table, picnic table, tisch, "
-    "esstisch, стол, обеденный стол",
+    "esstisch, стол, обеденный стол, mesa",
     "desk": "writing desk, computer desk, office desk, computer table, work table, writing "
     "table, dressing table, vanity table, schreibtisch, письменный стол",
     "coffee table": "tea table, side table, end table, cocktail table, low table, corner table, "
     "couchtisch, beistelltisch, журнальный стол, журнальный столик",
     "shelf": "bookshelf, bookcase, book shelf, shelving, shelving unit, rack shelf, regal, "
-    "bücherregal, полка, стеллаж",
+    "bücherregal, полка, стеллаж, estantería",
     "cabinet": "cabinetry, cupboard, sideboard, buffet, credenza, dresser, dresser mirror, "
     "bureau, chest of drawers, drawer chest, chest of drawer, drawer, drawers, tv "
     "stand, tv unit, tv bench, television stand, kommode, anrichte, комод, тумба, "
-    "schrank",
-    "wardrobe": "closet, armoire, kleiderschrank, шкаф, гардероб",
+    "schrank, schränke",
+    "wardrobe": "closet, armoire, kleiderschrank, шкаф, гардероб, armario",
     "nightstand": "night stand, bedside table, night table, bedside cabinet, nachttisch, "
     "тумбочка, прикроватная тумбочка",
     "floor lamp": "lamp, standing lamp, stehlampe, торшер",
     "armchair": "arm chair, easy chair, lounge chair, club chair, wing chair, sofa chair, "
     "recliner, rocking chair, rocker, massage chair, gaming armchair, lazy sofa, "
-    "sessel, кресло",
+    "sessel, кресло, sillón",
     "office chair": "swivel chair, desk chair, task chair, computer chair, gaming chair, "
     "bürostuhl",
-    "chair": "dining chair, kitchen chair, side chair, stuhl, стул",
+    "chair": "dining chair, kitchen chair, side chair, seat, stuhl, stühle, стул, silla",
     "stool": "ottoman, pouf, pouffe, puff, footstool, foot stool, foot rest, footrest, hassock, "
     "hocker, табурет, табуретка, пуф",
     "bar stool": "counter stool, bar chair, high stool, barhocker, барный стул",
     "bench": "sitzbank, скамья, скамейка, лавка",
 }  # fmt: skip
 """Other names of the classes: of COCO, ADE20K, NYU40, ScanNet, SUN RGB-D, 3D-FRONT, Objectron and
-Open Images, and the commonest German and Russian ones."""
+Open Images, and the commonest German, Russian and Spanish ones."""
 
 OTHER_THINGS = (
     "object, other furniture, otherfurniture, otherstructure, otherprop, tv, television, "
@@ -178,9 +178,10 @@ NOISE = (
     "sm sk skm bp mi geo geom mesh obj prop asset model lod node grp group instance inst static "
     "item furniture the left right front rear middle small big large new old black white red "
     "blue brown green grey gray dark light wood wooden leather metal plastic modern copy clone "
-    "final low high poly lowpoly highpoly"
+    "final low high poly lowpoly highpoly seat seater sitzer rund gross groß klein eckig oval"
 )
 """Words of file names and nodes that say nothing of the class."""
+PLURALS = ("", ""), ("s", ""), ("es", ""), ("ves", "f"), ("ies", "y"), ("e", ""), ("en", "")
 
 WIDE_CLASSES: dict[str, tuple[str, ...]] = {
     "dining table": ("table", "coffee table", "desk"),
@@ -233,7 +234,7 @@ def plain_name(category: str) -> str:
     turned = (" ".join(some[::-1]) for some in words)  # Table_Coffee
     tails = (" ".join(some[k:]) for some in words for k in range(1, len(some)))
     for name in (*parts, *short, *turned, *tails):  # as it is, or as a plural of a known name
-        for old, new in (("", ""), ("s", ""), ("es", ""), ("ves", "f"), ("ies", "y")):
+        for old, new in PLURALS:
             form = name.removesuffix(old) + new if name.endswith(old) else ""
             if form in _known_names():
                 return form
@@ -256,7 +257,7 @@ def unknown_names(categories: Iterable[str]) -> str:
     """What to say of names that mean nothing here, with the nearest known ones; empty: all do."""
     known, said = _known_names(), list[str]()
     for word in sorted({c for c in categories if plain_name(c) not in known}):
-        near = difflib.get_close_matches(plain_name(word), known, n=1, cutoff=0.7)
+        near = difflib.get_close_matches(plain_name(word), known, n=1, cutoff=0.75)
         said.append(f"{word!r}" + (f" (is it {near[0]!r}?)" if near else ""))
     if not said:
         return ""

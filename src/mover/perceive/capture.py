@@ -81,7 +81,6 @@ DENSEST = 20.0  # frames a second
 CHUNK = 50  # frames whose detections are kept together
 # How far off a focal length may be, of its logarithm; what a file gives stays as it is.
 ASSUMED = 0.15  # cameras of phones and rooms are 50 to 75 degrees wide
-SAME_FORMAT = 0.01  # difference of two ratios of width and height
 GUESS = "perceived/guess.json"  # the camera before a first scene, and as it left it
 LENS_FIELDS = ("height", "focal_spread", "focal_by_lines", "tilt_spread")
 """Of camera.json, beside the camera."""
@@ -336,7 +335,7 @@ def lens_of(
     """
     photo = file if file is not None and file.suffix.lower() in PICTURES else None
     if file is not None and photo is None:
-        return _in_pixels_of(size, read_camera_file(file, size)), None
+        return read_camera_file(file, size), None
     if fov is not None:
         return guessed_view(fov, size), None
     known = None if photo is None else camera_of_photo(photo, size)
@@ -348,24 +347,6 @@ def lens_of(
         "or --fov DEGREES (GeoCalib, MoGe and others estimate both lens and tilt)"
     )
     return with_spread(of_view(USUAL, size, "assumed"), ASSUMED), text
-
-
-def _in_pixels_of(size: tuple[int, int], at: At) -> At:
-    """The fields of camera.json in the pixels of these frames; a calibration may be of larger ones.
-
-    Raises:
-        InputError: If the calibration is of pictures of another format.
-    """
-    own = tuple(int(at.get(name).number(1, 1e5)) for name in ("w", "h"))
-    if abs(own[0] * size[1] - own[1] * size[0]) > SAME_FORMAT * own[0] * size[1]:
-        raise InputError(
-            f"{at.file}: is of pictures of {own[0]} x {own[1]} pixels, expected the format of the "
-            f"frames, {size[0]} x {size[1]}"
-        )
-    zoom = {"fl_x": size[0] / own[0], "cx": size[0] / own[0]}
-    zoom |= {"fl_y": size[1] / own[1], "cy": size[1] / own[1]}
-    scaled = {k: v if k not in zoom else zoom[k] * float(v) for k, v in at.value.items()}
-    return at.holding({**scaled, "w": size[0], "h": size[1]})
 
 
 def read_picture_of(folder: Path) -> Picture:

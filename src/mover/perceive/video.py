@@ -16,7 +16,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from mover.core.errors import InputError
-from mover.core.files import instead, replacing
+from mover.core.files import instead, not_there, replacing
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import fingerprint, record
 from mover.io.files.images import opened
@@ -94,7 +94,7 @@ def stamp_of(source: Path) -> tuple[int, int]:
         times = [p.stat().st_mtime_ns for p in pictures_of(source)]
         return len(times), max(times)
     if not source.is_file():
-        raise InputError(f"{source}: there is no such file, expected a video or a folder")
+        raise InputError(f"{source}: {not_there(source)}, expected a video or a folder")
     stat = source.stat()
     return stat.st_size, stat.st_mtime_ns
 

@@ -125,6 +125,12 @@ def _hints(args: ImportArgs, work: Path) -> "Hints":
         camera = guessed_view(args.fov, size)
     elif camera is None and args.image is not None:
         camera = camera_of_photo(args.image, size)
+    elif camera is not None and args.image is not None and size is not None:
+        sides = camera.get("w").value, camera.get("h").value
+        if sides != size:
+            found = f"is of pictures of {sides[0]} x {sides[1]} pixels, {args.image.name}"
+            cure = "one size: --camera FILE scales a lens to the image"
+            raise InputError(f"{camera.file}: {found} has {size[0]} x {size[1]}, expected {cure}")
     if args.recording and args.recordings:
         raise InputError("--recording, --recordings: both are given, expected one of them")
     names = [item.partition("=") for item in args.names]

@@ -15,7 +15,7 @@ from mover.app.cli import say
 from mover.app.cli.people import FitArgs, fit_into
 from mover.app.cli.run import THREADS, reconstruct_into
 from mover.core.errors import InputError
-from mover.core.files import unreadable
+from mover.core.files import not_there, unreadable
 from mover.core.settings import Index, float_in
 from mover.perceive.config import PICTURES, LayoutConfig, PerceiveConfig, missing
 from mover.pipeline.presets import PRESETS
@@ -64,10 +64,8 @@ def take_depth(depth: Path, capture: Path) -> None:
     from mover.io.files.images import DEPTH, find_depth_file, read_depth, reference_frame
 
     if not depth.is_file():
-        what, cure = "there is no such file", ""
-        if depth.is_dir():
-            what, cure = "is a folder", ": name the file of the reference picture in it"
-        raise InputError(f"{depth}: {what}, expected a depth map{cure}")
+        cure = ": name the file of the reference picture in it" if depth.is_dir() else ""
+        raise InputError(f"{depth}: {not_there(depth)}, expected a depth map{cure}")
     if not capture.is_dir():
         raise InputError(f"{capture}: there is no such folder, expected a capture")
     place = capture / DEPTH / f"000000{depth.suffix.lower()}"
@@ -205,8 +203,8 @@ def video_to_room(
         InputError: If something is missing, or there is no furniture.
     """
     source, config = args.source, config or PerceiveConfig()
-    if not source.exists():
-        raise InputError(f"{source}: there is no such file, expected a video or a folder")
+    if not source.is_file() and not source.is_dir():
+        raise InputError(f"{source}: {not_there(source)}, expected a video or a folder")
     if source.suffix.lower() in (".json", ".npz", ".pkl", ".txt"):
         raise InputError(f"{source}: is no video, expected one, or a folder of its pictures")
     flags.preset_named(args.preset, PRESETS)
@@ -314,8 +312,8 @@ def _check_needs(args: VideoArgs, config: PerceiveConfig) -> None:
         InputError: With a line for each thing that is missing, and what to do about it.
     """
     for path in (args.people_masks, args.objects):
-        if path is not None and not path.exists():
-            raise InputError(f"{path}: there is no such file, expected masks or outlines")
+        if path is not None and not path.is_file() and not path.is_dir():
+            raise InputError(f"{path}: {not_there(path)}, expected masks or outlines")
     own = args.keypoints not in (NETWORK, MEDIAPIPE)
     if own and chain.OUT not in args.keypoints and not Path(args.keypoints).exists():
         raise InputError(

@@ -269,17 +269,22 @@ def _check_apart(whole: Parts) -> Iterator[str]:
     camera = _camera_of(whole)
     if camera is None and (whole.people is not None or whole.scene is not None):
         raise InputError(f"{whole.name}: has no camera, expected --camera FILE or --fov DEGREES")
-    masks: list[tuple[str, list[Masks]]] = []
+    groups: list[tuple[str, str, Masks]] = []  # file, name, masks of one
     if camera is not None and whole.objects is not None:
         found = detections_of(whole.objects, camera, ignored.append)
-        seen = [one.mask for one in found if one.mask is not None]
-        masks.append((whole.objects.file, seen))
+        file = whole.objects.file
+        groups += [(file, f"{d.category} ({d.id})", d.mask) for d in found if d.mask is not None]
     if camera is not None and whole.people is not None:
         people = people_of(whole.people, camera, ignored.append).people
-        masks.append((whole.people.file, [] if people is None else [people.masks]))
-    for file, every in masks:
-        if every and agree.bounded(every).mean() < MOST:
-            yield f"{file}: most masks fill the picture to its borders; inverted?"
+        if people is not None:
+            for track in people.person.unique().tolist():
+                few = rows_of(people, people.person == track).masks
+                groups.append((whole.people.file, f"person {track}", few))
+    for file in dict.fromkeys(file for file, *_ in groups):
+        masks = {name: masks for other, name, masks in groups if other == file}
+        odd = [name for name, of_one in masks.items() if agree.bounded([of_one]).mean() < MOST]
+        if odd:
+            yield f"{file}: masks fill the picture to its borders, inverted? {', '.join(odd[:9])}"
 
 
 def _camera_of(whole: Parts) -> Camera | None:

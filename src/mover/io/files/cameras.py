@@ -16,7 +16,7 @@ from mover.core.errors import InputError
 from mover.core.files import unreadable
 from mover.core.types import Tilt
 from mover.geometry.camera import tilted
-from mover.io.files.fields import LARGEST, At, read_json, read_npy, read_npz
+from mover.io.files.fields import LARGEST, At, existing, read_json, read_npy, read_npz
 from mover.io.files.images import ORIENTATION, opened
 from mover.io.files.schema import Positive, Side, checked
 
@@ -29,6 +29,7 @@ BY_EXIF = 0.05  # the same of a photo, whose picture a video's frames may be a p
 BY_GRAVITY = 1.0  # error of pitch and roll of a phone that is held still [degrees]
 WIDEST = 175.0  # [degrees], of a pinhole camera
 WIDEST_TILT = 0.5  # [rad], an error of the tilt that is as good as none
+SAME_FORMAT = 0.01  # difference of two ratios of width and height
 STRAIGHT = 2.0  # [px], a lens that moves the corners by less is left as it is
 MATRIX = (
     "camera_mtx", "Intrinsics", "camera_matrix", "Camera_Matrix", "cameraMatrix",
@@ -76,18 +77,40 @@ def read_camera_file(path: Path, size: Size) -> At:
 
     Args:
         path: Of the file.
-        size: Width and height of the image, which most of them lack [px].
+        size: Width and height of the image, which most of them lack, and to which the camera is
+            scaled [px].
 
     Raises:
-        InputError: If the file cannot be understood, the lens is not straight, or the size is
-            needed and not known.
+        InputError: If the file cannot be understood, the lens is not straight, its pictures have
+            another shape, or the size is needed and not known.
     """
+    return in_pixels_of(size, _read_camera(path, size))
+
+
+def in_pixels_of(size: Size, at: At) -> At:
+    """The fields of camera.json in the pixels of an image of the same shape, if of another size."""
+    own = at.maybe("w"), at.maybe("h")
+    if size is None or None in own:
+        return at
+    (w, h), (width, height) = (checked(side, Side) for side in own if side), size
+    if (w, h) == size:
+        return at
+    found = f"is of pictures of {w} x {h} pixels"
+    if abs(w * height - h * width) > SAME_FORMAT * w * height:
+        cure = f"the shape of the image, {width} x {height} (its own lens, or --fov)"
+        raise InputError(f"{at.file}: {found}, expected {cure}")
+    log.warning("%s: %s; it is scaled to the image of %d x %d", at.file, found, width, height)
+    zoom = {"fl_x": width / w, "cx": width / w, "fl_y": height / h, "cy": height / h}
+    scaled = {k: f * at.get(k).number() for k, f in zoom.items() if k in at.value}
+    return at.holding({**at.value, **scaled, "w": width, "h": height})
+
+
+def _read_camera(path: Path, size: Size) -> At:
+    """The camera in the pixels of the file's own pictures, where it has their size."""
     if path.is_dir():
         files = (path / name for name in ("cameras.txt", "cameras.bin", "camera.json"))
         path = next((file for file in files if file.is_file()), path)
-    if not path.is_file():
-        raise InputError(f"{path}: there is no such file, expected a camera")
-    match path.suffix.lower():
+    match existing(path, "a camera").suffix.lower():
         case ".json":
             return camera_of_tree(read_json(path), size)
         case ".xml" | ".yml" | ".yaml":
@@ -114,7 +137,8 @@ def camera_of_tree(at: At, size: Size) -> At:
     """The fields of camera.json from a mapping of any known kind."""
     if at.maybe("fl_x") is not None:
         return At({"w": size[0], "h": size[1], **at.value} if size else at.value, at.file)
-    if (given := at.maybe(*MATRIX)) is not None:
+    given = at.maybe(*MATRIX)
+    if given is not None and not (isinstance(given.value, Mapping) and "fx" in given.value):
         return _of_matrix(_checked(_numbers(given), given), size, at)
     found = [(way, one) for way, one in _objects(at) if {"fx", "fy"} <= one.value.keys()]
     if not found:
@@ -125,7 +149,9 @@ def camera_of_tree(at: At, size: Size) -> At:
     if None in four:
         one.refuse("a lens with fx, fy, ppx, ppy or cx, cy")
     lens = one.holding([n.value for n in four if n])
-    return _of_matrix(_checked(_numbers(lens), lens), size, one)
+    sides = {k: n for names in SIDES for k in names if (n := at.value.get(k)) is not None}
+    beside = one.holding({**sides, **one.value})  # the size may stand outside
+    return _of_matrix(_checked(_numbers(lens), lens), size, beside)
 
 
 def _objects(at: At, way: str = "", depth: int = 3) -> Iterator[tuple[str, At]]:
@@ -146,10 +172,10 @@ def _numbers(at: At) -> NDArray[np.float64]:
 def _of_matrix(K: NDArray[np.float64], size: Size, at: At, shift: float = HALF) -> At:
     """A camera from its matrix, and the size, the distortion and the pose beside it in `at`.
 
-    The principal point of the matrix lacks a `shift` [px]; the size goes before that of the file.
+    The principal point of the matrix lacks a `shift` [px]; `size` counts where the file has none.
     """
     sides = [at.maybe(*names) for names in SIDES]
-    if size is None and None not in sides:
+    if None not in sides:
         w, h = (checked(s.holding(int(_numbers(s)[0])), Side) for s in sides if s)
         size = w, h
     if (bent := at.maybe(*BENT)) is not None:

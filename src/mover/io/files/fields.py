@@ -18,7 +18,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
-from mover.core.files import BROKEN, reason, replacing, unreadable
+from mover.core.files import BROKEN, not_there, reason, replacing, unreadable
 
 log = logging.getLogger(__name__)
 Warn = Callable[[str], None]
@@ -152,6 +152,8 @@ def shown(value: Any) -> str:  # noqa: ANN401
         return "nothing"
     if isinstance(value, np.ndarray):
         return f"shape {value.shape} of {value.dtype}"
+    if isinstance(value, Mapping) and value:
+        return f"an object of {', '.join(map(str, value))[:60]}"
     if isinstance(value, int) and abs(value) > 10**18:
         return "a huge number"
     text = json.dumps(value) if isinstance(value, str) else repr(value)
@@ -177,7 +179,9 @@ def existing(path: Path, expected: str = "") -> Path:
     if not path.is_file():
         inner = path.parent / "room" / name  # of OUT of `mover video`
         more = f", but in {inner.parent}" if inner.is_file() else more
-        raise InputError(f"{name}: there is no such file in {path.parent}{more}")
+        raise InputError(
+            f"{name}: {not_there(path, f'there is no such file in {path.parent}')}{more}"
+        )
     if (size := path.stat().st_size) > LARGEST_FILE:
         raise InputError(f"{name}: has {size} bytes, expected at most {LARGEST_FILE}")
     return path
@@ -237,30 +241,32 @@ def is_amass(at: At) -> bool:
     return "trans" in keys and "frame" not in keys and not keys.isdisjoint(("poses", "pose_body"))
 
 
-def read_npz(path: Path) -> At:
-    """The arrays of an .npz file by name; one of objects or fields is `NotPlain`."""
+def read_npz(path: Path, most: int = LARGEST_FILE) -> At:
+    """The arrays of an .npz file by name, of `most` bytes; odd ones are `NotPlain`."""
     name = existing(path, "an .npz file").name or path.resolve().name
     try:
-        odd = _odd_arrays(path)
+        odd = _odd_arrays(path, most)
         with np.load(path, allow_pickle=False) as arrays:
             return At({key: odd.get(key) or arrays[key] for key in arrays.files}, name)
     except BROKEN as error:
         raise unreadable(path, error, "an .npz file") from error
 
 
-def _odd_arrays(path: Path) -> dict[str, NotPlain]:
+def _odd_arrays(path: Path, most: int) -> dict[str, NotPlain]:
     """Arrays that are not plain; sizes that are promised are checked before any is unpacked."""
     total, odd = 0, dict[str, NotPlain]()
     with zipfile.ZipFile(path) as archive:
         for entry in archive.infolist():
+            if not entry.filename.endswith(".npy"):
+                raise ValueError(f"it is a zip archive with {entry.filename}")
             with archive.open(entry) as stream:
                 dtype, size = _header(stream)
             total += size
             key = entry.filename.removesuffix(".npy")
             if dtype.hasobject or dtype.fields:
                 odd[key] = NotPlain()
-            if total > LARGEST_FILE:
-                found = f"has {total} bytes or more, expected at most {LARGEST_FILE} in the file"
+            if total > most:
+                found = f"has {total} bytes or more, expected at most {most} in the file"
                 raise InputError(f"{path.name}: field '{key}' {found}")
     return odd
 
@@ -282,15 +288,14 @@ def read_npy(path: Path) -> At:
     Raises:
         InputError: If it is missing, broken, promises more than it has or holds pickled objects.
     """
-    if not path.is_file():
-        raise InputError(f"{path.name}: there is no such regular file in {path.parent}")
+    existing(path, "an .npy file")
     try:
         with path.open("rb") as file:
             dtype, size = _header(file)
             if dtype.hasobject or dtype.fields:
                 found = f"has {dtype}, expected plain numbers (no pickled objects)"
                 raise InputError(f"{path.name}: {found}")
-            if size > min(LARGEST_FILE, path.stat().st_size):
+            if size > path.stat().st_size:
                 found = f"promises {size} bytes, expected no more than it has"
                 raise InputError(f"{path.name}: {found}")
             file.seek(0)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mover.core.errors import InputError
-from mover.core.files import reason, replacing, unreadable
+from mover.core.files import not_there, reason, replacing, unreadable
 from mover.core.types import Camera, DepthImage
 from mover.io.files.fields import At, read_npy, read_npz
 from mover.io.files.meshes import inside
@@ -38,15 +38,15 @@ def opened(
 
     try:
         if not path.is_file():
-            raise FileNotFoundError("there is no such regular file")
+            raise FileNotFoundError(f"it {not_there(path, 'does not exist')}")
         with warnings.catch_warnings():
-            warnings.simplefilter(bombs, Image.DecompressionBombWarning)
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             with Image.open(path) as picture:
+                (w, h), most = picture.size, Image.MAX_IMAGE_PIXELS or math.inf
+                if bombs == "error" and w * h > most:
+                    raise ValueError(f"it is too large: {w} x {h} pixels, at most {most} are read")
                 yield picture
-    except (
-        OSError, ValueError, SyntaxError, Image.DecompressionBombError,
-        Image.DecompressionBombWarning,
-    ) as error:  # fmt: skip
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         if at is not None:
             at.refuse(expected, f"{str(at.value)!r}, which cannot be read ({reason(error, path)})")
         raise unreadable(path, error, expected) from error

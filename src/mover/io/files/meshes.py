@@ -7,6 +7,7 @@ behind options of the material. They are found where they lie, at or below the f
 import json
 import re
 import warnings
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BytesIO
@@ -19,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
-from mover.core.files import copy_whole, instead, reason, replacing
+from mover.core.files import copy_whole, instead, not_there, reason, replacing
 from mover.core.types import Mesh, SeatStretch
 from mover.io.files.fields import LARGEST, LARGEST_FILE, At, shown
 
@@ -111,9 +112,11 @@ def check_faces(at: At, faces: NDArray[Any], count: int) -> None:
 
 def gltf_tree(path: Path) -> Any:  # noqa: ANN401
     """The JSON of a .gltf or .glb; what it holds is not checked."""
-    content = path.read_bytes()
+    content, binary = path.read_bytes(), path.suffix.lower() == ".glb"
+    if not content.startswith(b"glTF") if binary else b"\0" in content[:64]:
+        raise ValueError("it is no glTF")
     end = 20 + int.from_bytes(content[12:16], "little")
-    return json.loads(content[20:end] if path.suffix.lower() == ".glb" else content)
+    return json.loads(content[20:end] if binary else content)
 
 
 def check_gltf(at: At, path: Path, *, pictures: bool = False) -> None:
@@ -136,6 +139,19 @@ def check_gltf(at: At, path: Path, *, pictures: bool = False) -> None:
     for count, most, what in _amounts(tree):
         if count > most:
             at.refuse(f"at most {most}", f"{at.value!r} with {count} {what}")
+    _check_trees(at, [node.get("children", []) for node in tree.get("nodes", [])])
+
+
+def _check_trees(at: At, children: list[list[int]]) -> None:
+    """Refuse nodes of several parents and nodes in a circle: glTF has trees."""
+    parents = Counter(child for some in children for child in some)
+    if max(parents.values(), default=0) > 1:
+        at.refuse("trees of nodes", f"{at.value!r} with a node of several parents")
+    reached = [node for node in range(len(children)) if node not in parents]
+    for node in reached:  # grows
+        reached.extend(children[node] if node >= 0 else ())
+    if len(reached) < len(children):
+        at.refuse("trees of nodes", f"{at.value!r} with nodes in a circle")
 
 
 def _uris(tree: Any) -> Iterator[tuple[str, dict[str, str], str]]:  # noqa: ANN401
@@ -347,7 +363,7 @@ def inside(at: At, folder: Path) -> Path:
         if not full.is_relative_to(folder.resolve()):
             at.refuse("a file inside the capture's folder", f"{name!r}, a link that leaves it")
         if not full.is_file():
-            at.refuse("a file", f"{shown(name)}, which does not exist")
+            at.refuse("a file", f"{shown(name)}, which {not_there(full, 'does not exist')}")
     except (OSError, RuntimeError) as error:  # names that are too long, links in a circle
         at.refuse("a file", f"{shown(name)}, which cannot be found ({reason(error)})")
     return full

@@ -107,7 +107,9 @@ def is_drawn(segmentation: Any) -> bool:  # noqa: ANN401
 
 
 def _runs(counts: Any, at: At) -> NDArray[np.int64]:  # noqa: ANN401
-    """The runs of a code of either kind."""
+    """The runs of a code of either kind, which Python may have printed."""
+    if isinstance(counts, str) and re.fullmatch(r"b'.*'|b\".*\"|\[.*]", counts.strip()):
+        counts = _unprinted(counts, counts)
     if isinstance(counts, list | tuple):
         if not all(type(n) is int and abs(n) < 1 << 40 for n in counts):
             at.refuse("whole numbers in it", "a list of counts")
@@ -115,12 +117,12 @@ def _runs(counts: Any, at: At) -> NDArray[np.int64]:  # noqa: ANN401
     if not isinstance(counts, str | bytes):
         found = f"{type(counts).__name__} as counts"
         at.refuse("a list of runs or a compressed code", found)
-    if isinstance(counts, str) and re.fullmatch(r"b'.*'|b\".*\"", counts):
-        counts = _unprinted(counts, counts)
     try:
         return run_lengths(counts if isinstance(counts, bytes) else counts.encode("ascii"))
     except ValueError as error:
-        at.refuse("COCO's compressed code", f"counts with {error}")
+        coded = re.match(r"iVBOR|/9j/|data:image", str(counts))
+        found = f"counts with {error}"
+        at.refuse("COCO's compressed code", "a picture in base64" if coded else found)
 
 
 def _check_polygon(polygon: Any, reach: float, at: At, what: str) -> None:  # noqa: ANN401
@@ -131,7 +133,8 @@ def _check_polygon(polygon: Any, reach: float, at: At, what: str) -> None:  # no
         at.refuse("numbers x, y without quotes", f"{what} text ({words[0][:40]!r})")
     real = all(type(v) in (int, float) for v in given)
     if not real or len(given) < 2 * CORNERS or len(given) % 2:
-        found = f"{len(given)} items" if polygon is given and real else str(polygon)[:40]
+        count = f"{len(given)} numbers{', an odd count' if len(given) % 2 else ''}"
+        found = count if polygon is given and real else str(polygon)[:40]
         at.refuse(f"numbers x, y of {CORNERS} corners or more", f"{what} {found}")
     if not all(-reach <= v <= reach for v in given):
         at.refuse("pixels of the image", f"{what} a corner far outside")

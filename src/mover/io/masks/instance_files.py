@@ -2,7 +2,7 @@
 
 import dataclasses
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -91,9 +91,9 @@ def read_things(
         return found.people()
     kept, notes = tuple(item for item in found.items if not item.is_person), found.notes
     if bare := sum(item.category == UNKNOWN for item in kept):
-        notes += (f"{path.name}: {bare} of {len(kept)} masks have no category: --names 1=chair",)
+        notes += (f"{path.name}: masks without category: {bare} of {len(kept)} (--names 1=chair)",)
     if people_left := len(found.items) - len(kept):
-        notes += (f"{path.name}: {people_left} of people are left out (--reference-people)",)
+        notes += (f"{path.name}: masks of people left out: {people_left} (--reference-people)",)
     return dataclasses.replace(found, items=kept, notes=notes)
 
 
@@ -144,7 +144,7 @@ def _of_folder(
     homes = [path] if pictures_in(path) else [p for p in path.iterdir() if p.is_dir()]
     if found := [file for home in homes for file in pictures_in(home)]:
         return read_label_images(found, path, names, people=people)
-    files = sorted(path.glob("*.json"), key=natural)
+    files = sorted(path.glob("*.json"), key=natural) or sorted(path.glob("*.npz"), key=natural)
     stem = Path(picture or "").stem.lower()
     ours = [file for file in files if file.stem.lower() == stem] if len(files) > 1 else []
     if ours:
@@ -155,8 +155,15 @@ def _of_folder(
         if file.suffix.lower() in FOREIGN:
             return read_instances(file, names, size)
     if not files:
-        raise InputError(f"{path}: has no masks, expected pictures (.png), .npy or .json files")
-    parts = [_of_json(read_json(file), names, size, picture) for file in files]
+        raise InputError(f"{path}: has no masks, expected pictures (.png), .npy, .npz or .json")
+    lone = people and len(files) == 1
+    parts = [read_instances(f, names, size, people=lone, picture=picture) for f in files]
+    many = [part.file for part in parts if len({item.frame for item in part.items}) > 1]
+    if many and len(files) == 1:
+        return parts[0]
+    if many:
+        found = f"has {len(files)} files, of which {many[0]} has several frames"
+        raise InputError(f"{path.name}: {found}, expected a frame in each file, or one file")
     numbers = [number_in(file.stem, rank) for rank, file in enumerate(files)]
     frames, notes = frames_of(numbers, f"{path.name}: numbers")
     sizes = {part.size for part in parts if part.size is not None}
@@ -186,13 +193,13 @@ def _of_json(at: At, names: Names, size: Size | None, picture: str | None) -> In
     }
     for found in (name for name, seen in foreign.items() if seen):
         raise InputError(f"{at.file}: is {found}, expected its export as {EXPORTS[found]}")
+    if keys and all({"labels", "scores"} <= k or "predictions" in k for k in keys):
+        return _of_mmdet(at, names, size)
     if isinstance(at.value, list):
         return list_instances(at, names, size)
     (have,) = keys
     if have & {"box_format", "img_width"}:
         return coco_instances(_of_grounded_sam(at), names, size, picture)
-    if "predictions" in have or {"labels", "scores"} <= have:
-        return _of_mmdet(at, names, size)
     if "annotations" in have and "image" in have - {"images"} and "images" not in have:  # SA-1B
         rows = [{**row.mapping(), "image_id": 0} for row in at.get("annotations").items()]
         tree = {"images": [{**at.get("image").mapping(), "id": 0}], "annotations": rows}
@@ -274,6 +281,8 @@ def coco_instances(
         notes = (f"{at.file}: of {len(listed)} images only {ours.file_name or ours.id} is taken",)
         listed = [(item, image) for item, image in listed if image.id == ours.id]
         rows = [(item, row) for item, row in rows if row.image_id == ours.id]
+    elif picture and listed and listed[0][1].stem.lower() not in ("", Path(picture).stem.lower()):
+        notes = (f"{at.file}: its only image, {listed[0][1].file_name}, is taken for {picture}",)
     if picture is not None and len(rows) > MOST_THINGS:
         at.get("annotations").refuse(f"at most {MOST_THINGS} in a picture", f"{len(rows)} items")
     need = "width and height, here or by --image"
@@ -424,25 +433,34 @@ def _of_grounded_sam(at: At) -> At:
 
 
 def _of_mmdet(at: At, names: Names, size: Size | None) -> Instances:
-    """Predictions of MMDetection's DetInferencer: lists of labels, scores, bboxes and masks."""
-    outer = at.maybe("predictions")
-    at = at if outer is None else outer.items(1)[0]
+    """Predictions of MMDetection's DetInferencer, of one picture or one for each frame."""
+    every = at.items() if isinstance(at.value, list) else [at]
+    inner = [(one, one.maybe("predictions")) for one in every]
+    entries = [item for one, held in inner for item in (held.items() if held else [one])]
+    drawn = (m for one in entries if (masks := one.maybe("masks")) for m in masks.items())
+    size = _size_of(mask) if (mask := next(drawn, None)) is not None else size
+    rows = [row for k, one in enumerate(entries) for row in _predictions(one, k, names, size)]
+    found = tuple(row for row in rows if row is not None)
+    low = f"detections with scores below {LEAST_SCORE} left out: {rows.count(None)} of {len(rows)}"
+    several = f"{len(entries)} entries of MMDetection are frames in their order"
+    said = {low: len(rows) > len(found), several: len(entries) > 1}
+    notes = tuple(f"{at.file}: {text}" for text, holds in said.items() if holds)
+    return Instances(found, size, at.file, frozenset(range(len(entries))), notes)
+
+
+def _predictions(at: At, frame: int, names: Names, size: Size | None) -> Iterator[Instance | None]:
+    """One entry, lists of labels, scores, bboxes and masks; None for what has a low score."""
     labels, boxes, masks = at.get("labels"), at.maybe("bboxes"), at.maybe("masks")
-    scores, found, few = at.get("scores").items(), list[Instance](), 0
-    keys = checked(labels, list[Id])
+    scores, keys = at.get("scores").items(), checked(labels, list[Id])
     table = {str(k): name for k, name in enumerate(COCO_CLASSES)} | dict(names)
     if len({len(keys), len(scores), *(len(one.items()) for one in (boxes, masks) if one)}) > 1:
         labels.refuse(f"as many as scores, bboxes and masks ({len(scores)})", f"{len(keys)} items")
     for k, key in enumerate(keys):
-        score = scores[k].number(0, 1)
-        few += score < LEAST_SCORE
-        if score < LEAST_SCORE:
+        if (score := scores[k].number(0, 1)) < LEAST_SCORE:
+            yield None
             continue
         if str(key) not in table:
             labels.items()[k].refuse(f"a class of COCO, 0 to {len(COCO_CLASSES) - 1}, or --names")
         box = None if boxes is None else tuple(boxes.items()[k].vector(4))
-        given = None if masks is None else masks.items()[k]
-        size = size if given is None else _size_of(given)
-        found.append(Instance(table[str(key)], box, code_in(given, size), score))
-    note = f"{at.file}: {few} of {len(keys)} detections with scores below {LEAST_SCORE} left out"
-    return Instances(tuple(found), size, at.file, notes=(note,) if few else ())
+        mask = code_in(None if masks is None else masks.items()[k], size)
+        yield Instance(table[str(key)], box, mask, score, frame)

@@ -111,7 +111,7 @@ class Instances:
                 raise InputError(f"{self.file}: has no people, only {named}, {wanted}")
             notes.append(f"{named} taken as people's")
         if bare := sum(item.mask is None for item in kept):
-            notes.append(f"{self.file}: {bare} boxes have no mask, which people need: left out")
+            notes.append(f"{self.file}: boxes without mask, which people need, left out: {bare}")
         return dataclasses.replace(self, items=tuple(kept), notes=tuple(notes))
 
     def objects_tree(self) -> At:
@@ -309,7 +309,7 @@ def labelme_instances(at: At) -> Instances:
     for (label, _), codes in groups.items():
         whole: Any = coco.merge(codes) if codes else {}
         found.append(Instance(label, None, whole.get("counts")))
-    said = f"{at.file}: {len(items) - len(areas)} shapes of points or lines are passed over"
+    said = f"{at.file}: shapes of points or lines passed over: {len(items) - len(areas)}"
     return Instances(tuple(found), size, at.file, notes=(said,) if areas != items else ())
 
 
@@ -334,16 +334,13 @@ def _pasted(item: At, shape: ShapeFields, size: Size) -> bytes | None:
     x, y = (int(v) for v in shape.points[0])
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             png = io.BytesIO(base64.b64decode(shape.mask or "", validate=True))
             with Image.open(png, formats=["PNG"]) as picture:
                 if picture.width > width or picture.height > height:
                     item.get("mask").refuse("a mask no larger than the image", f"{picture.size}")
                 pixels = np.asarray(picture.convert("L")) > 0
-    except (
-        OSError, ValueError, SyntaxError, Image.DecompressionBombError,
-        Image.DecompressionBombWarning,
-    ):  # fmt: skip
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
         item.get("mask").refuse("a PNG in base64", "what cannot be read")
     whole = np.zeros((height, width), dtype=bool)
     part = pixels[: height - y, : width - x]

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
+from mover.core.pickles import LARGEST
 from mover.io.capture.parts import UNKNOWN
-from mover.io.files.fields import At, read_json, read_npy
+from mover.io.files.fields import At, read_json, read_npy, read_npz
 from mover.io.files.images import opened
 from mover.io.masks.instances import Instance, Instances, Names, Size, code_of, frames_of
 from mover.io.people.values import natural, number_in, read_any
@@ -48,28 +49,29 @@ def read_label_images(
     channel that is not full, or with one value beside black, is one mask, soft rims or not; one
     with more values is a label map (a pixel is the number of a thing, 0 is nothing). Pictures whose
     names are the numbers of frames are a video, in which a label is a track. In a folder of folders
-    (SAM 2's) each is one object of a video. `source` is the folder or file that the user named; of
-    `people`, frames may have short numbers, too.
+    each is one object of a video (SAM 2's), or a frame (00000/0.png, as 00000_0.png). `source` is
+    the folder or file that the user named; of `people`, frames may have short numbers, too.
     """
     home = source if source.is_dir() else source.parent
     beside = read_json(home / LABELS) if (home / LABELS).is_file() else At({}, LABELS)
     table = {**{key: beside.get(key).text() for key in beside.mapping()}, **names}
     if source.is_dir():
         paths = sorted((p for p in paths if p.stem.lower() not in NOT_MASKS), key=natural)
-    homes = list(dict.fromkeys(path.parent for path in paths))
-    apart = source.is_dir() and source not in homes
-    numbers = _numbers_of([path.stem for path in paths], people=people or apart)
+    owners, framed, how = _things_and_frames(paths, source)
+    apart, ranks = bool(owners), list(dict.fromkeys(owners))
+    numbers = _numbers_of(framed, people=people or apart)
     if apart and numbers is None:
         bare = next((p.name for p in paths if not re.search(r"\d", p.stem)), paths[0].name)
         raise InputError(f"{bare}: has no number of a frame in its name")
     frames, notes = frames_of(list((numbers or {}).values()), f"{source.name}: numbers")
+    notes += (f"{source.name}: {how}",) if how else ()
 
     def rows() -> Iterator[Row]:
-        for path in paths:
-            frame = None if numbers is None else frames[numbers[path.stem]]
+        for k, path in enumerate(paths):
+            frame = None if numbers is None else frames[numbers[framed[k]]]
             if apart:
-                name = names.get(path.parent.name) or _word_of(path.parent.name) or UNKNOWN
-                track = number_in(path.parent.name, homes.index(path.parent))
+                name = names.get(owners[k]) or _word_of(owners[k]) or UNKNOWN
+                track = number_in(owners[k], ranks.index(owners[k]))
                 yield _labels_of(path) > 0, Instance(name, None, None, 1.0, frame or 0, track)
             else:
                 yield from _labelled(path, {**_classes_beside(path), **table}, frame)
@@ -83,6 +85,30 @@ def read_label_images(
         how = "pictures are people of one image; those of frames are named by numbers: 000000.png"
         notes = (*notes, f"{source.name}: {how}")
     return replace(found, notes=notes)
+
+
+def _things_and_frames(paths: Sequence[Path], source: Path) -> tuple[list[str], list[str], str]:
+    """Names of the thing (none: it has no name) and of the frame of each picture, and a note."""
+    stems, folders = [path.stem for path in paths], [path.parent.name for path in paths]
+    if not source.is_dir() or any(path.parent == source for path in paths):
+        pairs = [re.fullmatch(r"(\D*\d{3,})[_-](\D*\d{1,2})", stem) for stem in stems]
+        found = [pair for pair in pairs if pair is not None]
+        framed = [pair[1] for pair in found]
+        if len(found) < len(paths) or not _are_frames(framed):
+            return [], stems, ""
+        said = f"names like {stems[0]} are of a frame and of a person or thing in it"
+        return [pair[2] for pair in found], framed, said
+    short, long = (min(len(re.sub(r"\D", "", s)) for s in some) for some in (stems, folders))
+    objects = (long, len(set(folders))) <= (short, len(set(stems)))
+    if objects or not _are_frames(folders) or len(set(stems)) == len(stems):
+        return folders, stems, ""
+    return stems, folders, f"folders like {folders[0]} are frames, with the people or things in it"
+
+
+def _are_frames(names: list[str]) -> bool:
+    """Whether names are numbers, alone or behind words for frames."""
+    words = set(re.split(r"[\W_\d]+", " ".join(names).lower()))
+    return words <= FRAME_WORDS and _numbers_of(names, people=True) is not None
 
 
 def _labelled(path: Path, words: Names, frame: int | None) -> Iterator[Row]:
@@ -222,23 +248,21 @@ def _hardened(pixels: NDArray[np.int64], name: str, *, lossy: bool) -> NDArray[n
 def read_mask_arrays(path: Path, names: Names, *, people: bool = False) -> Instances:
     """Masks of an .npz, an .npy or a pickle.
 
-    `masks` is (n, h, w), (n, 1, h, w) or (frames, objects, h, w), as booleans, bytes, probabilities
-    (from 0 to 1, cut at .5) or logits (above 0 is inside); or a label map of whole numbers, (h, w),
-    or one for each frame, in which a label is a track. Beside it may stand `scores`, `labels`
-    (names), `object_ids` and `frame`. With a single object id (n, 1, h, w) is one thing in n
-    frames, and so is that of people without ids, as are n masks of people that lie on each other.
-    Boxes are those of the masks. A pickle, or the .npy of a mapping, may also be what SAM 2's video
-    predictor gives: {frame: {object: mask}}.
+    `masks` is (n, h, w), (n, 1, h, w), (frames, objects, h, w) or (objects, frames, h, w), as
+    booleans, bytes, probabilities (from 0 to 1, cut at .5) or logits (above 0 is inside); or a
+    label map of whole numbers, (h, w), or one for each frame, in which a label is a track. Beside
+    it may stand `scores`, `labels` (names), `object_ids` and `frame`. With a single object id
+    (n, 1, h, w) is one thing in n frames, and so is that of people without ids, as are n masks of
+    people that lie on each other. Boxes are those of the masks. A pickle, or the .npy of a mapping,
+    may also be what SAM 2's video predictor gives: {frame: {object: mask}}.
     """
-    at, notes = read_any(path), list[str]()
+    npz = path.suffix.lower() == ".npz"
+    at, notes = read_npz(path, LARGEST) if npz else read_any(path), list[str]()
     if isinstance(at.value, np.ndarray):
         at = at.holding({"masks": at.value})
-    match at.value:
-        case [{"pred_instances": _}, *_]:
-            found = "MMDetection's dump of a test ('pred_instances')"
-            at.refuse("masks: DetInferencer's preds/<image>.json (out_dir) has them", found)
-        case _:
-            pass
+    if isinstance(at.value, list) and "'pred_instances'" in str(at.value)[:1000]:
+        found = "MMDetection's dump of a test ('pred_instances')"
+        at.refuse("masks: DetInferencer's preds/<image>.json (out_dir) has them", found)
     at = at.maybe("video_segments") or at
     frames = [(key, at.get(key)) for key in at.mapping()]
     if frames and all(key.isdecimal() and isinstance(at.value, Mapping) for key, at in frames):
@@ -249,35 +273,40 @@ def read_mask_arrays(path: Path, names: Names, *, people: bool = False) -> Insta
         return _gathered(rows, path.name, "masks", (int(key) for key, _ in frames), said)
     given = at.maybe(*MASKS)
     if given is None:
-        at.refuse(f"an array named {', '.join(MASKS)}", f"the arrays {sorted(at.value)[:6]}")
-    stack = given.value
-    if isinstance(stack, np.ndarray) and stack.ndim == 4 and stack.shape[-1] == 1:
-        stack = np.moveaxis(stack, -1, 1)  # (frames, h, w, 1)
-    if not isinstance(stack, np.ndarray) or stack.dtype.kind not in "buif" or stack.ndim < 2:
-        given.refuse("an array of masks (n, h, w), (frames, objects, h, w) or labels (h, w)")
-    if stack.ndim > 4 or not stack.size:
-        given.refuse("an array of masks (n, h, w) or (frames, objects, h, w)")
-    stack = _cut(given, stack, notes)
+        at.refuse(f"an array named {', '.join(MASKS)}", ", ".join(sorted(at.value)[:6]) or "none")
+    stack = _stack_of(at, given, notes)
     flat, size = stack.reshape(-1, *stack.shape[-2:]), (stack.shape[-1], stack.shape[-2])
     if stack.dtype == np.bool_ or (stack.ndim > 2 and not _are_maps(stack)):
         found = _of_stack(at, stack, names, people=people)
         return replace(found, notes=(*notes, *found.notes))
-    still, frame = stack.ndim == 2, at.maybe("frame")
+    frame = at.maybe("frame")
     numbers = range(len(flat)) if frame is None else frame.indices(len(flat)).tolist()
     rows = (
-        (pixels == v, Instance(names.get(str(v), UNKNOWN), None, None, 1.0, number, track))
+        (pixels == v, Instance(names.get(str(v), UNKNOWN), None, None, 1.0, number, v))
         for number, pixels in zip(numbers, flat, strict=True)
         for v in _labels_in(given.holding(pixels))
-        for track in (None if still else v,)
     )
-    return replace(_gathered(rows, at.file, "masks", () if still else numbers), size=size)
+    return replace(_gathered(rows, at.file, "masks", () if stack.ndim == 2 else numbers), size=size)
+
+
+def _stack_of(at: At, given: At, notes: list[str]) -> NDArray[Any]:
+    """Masks or labels, cut: those of frames first, then of objects, the picture's axes behind."""
+    stack = given.value
+    known = isinstance(stack, np.ndarray) and stack.dtype.kind in "buif" and stack.size
+    if not known or not 2 <= stack.ndim <= 4:
+        given.refuse("an array of masks (n, h, w), (frames, objects, h, w) or labels (h, w)")
+    if stack.ndim == 4 and stack.shape[-1] == 1:
+        stack = np.moveaxis(stack, -1, 1)  # (frames, h, w, 1)
+    several = stack.ndim == 4 and 1 not in stack.shape[:2]
+    stack = _cut(given, stack, notes)
+    return _frames_first(at, stack, notes) if several else stack
 
 
 def _cut(at: At, value: NDArray[Any], notes: list[str]) -> NDArray[Any]:
     """Booleans, or whole numbers: logits are cut at 0, probabilities and grey values at half."""
     if value.dtype == np.bool_:
         return value
-    known = value[np.isfinite(value)]
+    known = value[np.isfinite(value)] if value.dtype.kind == "f" else value
     low, top = float(known.min(initial=0)), float(known.max(initial=0))
     if low < 0:
         return value > 0
@@ -332,7 +361,7 @@ def _of_stack(at: At, stack: NDArray[Any], names: Names, *, people: bool) -> Ins
     rows, tracks, notes = len(flat), None, ()
     bare = people and ids is None and frame is None and (stack.ndim < 4 or 1 in stack.shape[:2])
     sam = stack.ndim == 4 and stack.shape[1] == 1
-    in_frames = bare and rows > 1 and (sam or _follow_each_other(flat))
+    in_frames = bare and rows > 1 and (sam or _overlap(flat) > SAME)
     if bare and rows > 1:
         how = "are people of one image; frames need an array 'frame' or 'object_ids' beside"
         if in_frames:
@@ -352,7 +381,8 @@ def _of_stack(at: At, stack: NDArray[Any], names: Names, *, people: bool) -> Ins
     labels, sure = [UNKNOWN] * rows, np.ones(rows)
     if words is not None and isinstance(words.value, np.ndarray) and words.value.dtype.kind == "U":
         labels = [str(word) for word in words.array((rows,), "text")]
-    if scores is not None and isinstance(scores.value, np.ndarray) and scores.value.size == rows:
+    shapes = (rows,), stack.shape[:2], (rows, 1)
+    if scores and isinstance(scores.value, np.ndarray) and scores.value.shape in shapes:
         sure = np.clip(scores.array(scores.value.shape).reshape(-1), 0, 1)
 
     def row(i: int) -> Instance:
@@ -364,11 +394,22 @@ def _of_stack(at: At, stack: NDArray[Any], names: Names, *, people: bool) -> Ins
     return _gathered(things, at.file, "masks", frames.tolist(), notes)
 
 
-def _follow_each_other(flat: NDArray[Any]) -> bool:
-    """Whether masks lie on each other as those of one person in the frames of a video do."""
+def _frames_first(at: At, stack: NDArray[Any], notes: list[str]) -> NDArray[Any]:
+    """A stack (frames, objects, h, w); of which axis frames are, ids say, else overlaps do."""
+    a, b = stack.shape[:2]
+    ids, turned = at.maybe(*TRACKS), np.swapaxes(stack, 0, 1)
+    count = 0 if ids is None or a == b else np.size(ids.value)
+    other = count == a if count in (a, b) else _overlap(turned) > _overlap(stack)
+    how, few, many = ("objects, frames", a, b) if other else ("frames, objects", b, a)
+    notes.append(f"{at.file}: masks ({how}, h, w): {few} people or things in {many} frames")
+    return turned if other else stack
+
+
+def _overlap(stack: NDArray[Any]) -> float:
+    """How much of them masks share with the next along the first axis, as those of one person."""
     shares = list[float]()
-    for one, other in zip(flat[:-1] > 0, flat[1:] > 0, strict=True):
-        least = min(int(one.sum()), int(other.sum()))
-        if least:
-            shares.append(int((one & other).sum()) / least)
-    return len(shares) > 0 and float(np.median(shares)) > SAME
+    for one, other in zip(stack[:-1] > 0, stack[1:] > 0, strict=True):
+        sizes = np.minimum(one.sum((-2, -1)), other.sum((-2, -1)))
+        both = (one & other).sum((-2, -1))
+        shares += (both[sizes > 0] / sizes[sizes > 0]).ravel().tolist()
+    return float(np.median(shares)) if shares else 0.0

@@ -270,7 +270,7 @@ def pare(path: Path, known: Known) -> Iterator[Person]:
         raise InputError(f"{path.name}: PARE knows no lens: --camera names a camera.json")
     files = v.files_of(path, "PARE's results", "pare_output.pkl", "vibe_output.pkl", "*.pkl")
     for file, frame in zip(files, v.frames_in(files, path, known), strict=True):
-        at, people = v.read_any(file), list[tuple[int | None, At]]()
+        at, people = v.read_one(file, "PARE's results"), list[tuple[int | None, At]]()
         if at.maybe("orig_cam", "pred_pose") is None:  # of a video: people by track
             people += v.people_of(at)
         else:

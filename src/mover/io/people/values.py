@@ -80,8 +80,11 @@ def only_file(path: Path, what: str, *patterns: str) -> Path:
 
 
 def read_one(path: Path, what: str, *patterns: str) -> At:
-    """The content of the file itself, or of the only one of a folder."""
-    return read_any(only_file(path, what, *patterns))
+    """The content of the file itself, or of the only one of a folder, which is not AMASS's."""
+    at = read_any(only_file(path, what, *patterns))
+    if isinstance(at.value, Mapping) and is_amass(at):
+        raise InputError(f"{at.file}: is {AMASS}")
+    return at
 
 
 def number_in(name: str, index: int) -> int:

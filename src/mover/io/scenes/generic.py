@@ -24,7 +24,7 @@ from mover.core.types import Mesh
 from mover.furniture.library import choose_piece, plain_name, unknown_names
 from mover.geometry.rotations import affine
 from mover.io.capture.parts import Hints, Parts
-from mover.io.files.cameras import camera_of_tree
+from mover.io.files.cameras import camera_of_tree, in_pixels_of
 from mover.io.files.fields import At, read_json, reason
 from mover.io.files.images import image_size
 from mover.io.files.meshes import gltf_tree, load_parts, looks_lost
@@ -239,7 +239,7 @@ def box_parts(path: Path, hints: Hints) -> Parts:
     camera = hints.camera
     if camera is None and tree.camera is not None:
         size = None if hints.image is None else image_size(hints.image)
-        camera = camera_of_tree(At(tree.camera, at.file, "camera"), size)
+        camera = in_pixels_of(size, camera_of_tree(At(tree.camera, at.file, "camera"), size))
     turn = up_axes(hints.up or tree.up or "y")
     if tree.frame == "camera":
         tilt = None if camera is None else camera.maybe("R_cam_world")

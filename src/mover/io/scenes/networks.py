@@ -33,7 +33,7 @@ from mover.io.capture.folder import build_capture
 from mover.io.capture.parts import Hints, Parts
 from mover.io.capture.scene_file import scene_tree
 from mover.io.files.cameras import GUESSED, read_camera_file, read_intrinsics, with_spread
-from mover.io.files.fields import At, listed, read_json
+from mover.io.files.fields import At, existing, listed, read_json
 from mover.io.files.images import image_size, read_image
 from mover.io.files.meshes import KINDS, is_cloud, load_parts, looks_lost, mesh_of, read_mesh
 from mover.io.files.schema import rotation
@@ -99,8 +99,7 @@ class TotalBox:
 
 def load_mat(path: Path) -> At:
     """The arrays of a MATLAB file, read in a process of its own."""
-    if not path.is_file():
-        raise InputError(f"{path.name}: there is no such file in {path.parent}")
+    existing(path)
     call = [sys.executable, "-P", "-c", READ, str(path.resolve())]
     done = subprocess.run(call, capture_output=True, check=False)
     said = pickle.loads(done.stdout) if done.returncode == 0 else "its reader died"
@@ -310,18 +309,21 @@ def _things(folder: Path) -> tuple[list[Path], list[str]]:
     meshes = [path for path in paths if path not in clouds]
     once = {path.stem: path for path in reversed(meshes)}  # the first of each name
     if not once:
-        found = f"{len(clouds)} files of points or splats, " if clouds else ""
+        found = f"{listed('file', [p.name for p in clouds])} of splats, " if clouds else ""
         wanted = "expected <name>.glb with <name>.npz or .json"
         raise InputError(f"{folder}: has {found}no meshes, {wanted}")
+    posed = {p for p in once.values() if any(p.with_suffix(kind).is_file() for kind in TREES)}
+    bare = [] if not posed else [p for p in once.values() if p not in posed]
     notes = [
         f"{listed('file', [p.name for p in passed])} {why}: passed over"
         for passed, why in (
             (clouds, "of points without faces, as Gaussian splats are"),
             ([p for p in meshes if p != once[p.stem]], "of the name of another mesh"),
+            (bare, "without a pose (.npz or .json) beside it"),
         )
         if passed
     ]
-    return [p for p in meshes if p == once[p.stem]], notes
+    return [p for p in meshes if p == once[p.stem] and p not in bare], notes
 
 
 def _pose_beside(path: Path) -> At:
