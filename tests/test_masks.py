@@ -64,8 +64,8 @@ def test_polygons_are_joined_and_clipped():
 
 @pytest.mark.parametrize(("segmentation", "words"), [
     ([], "no polygon"),
-    ([[0, 0, 1, 1]], "4 items"),
-    ([[0, 0, 1, 1, 2, 2, 3]], "7 items"),
+    ([[0, 0, 1, 1]], "polygon 0 with 4 numbers"),
+    ([[0, 0, 1, 1, 2, 2, 3]], "7 numbers, an odd count"),
     ([[0, 0, 1, float("nan"), 2, 2]], "far outside"),
     ([[0, 0, 1, 1e300, 2, 2]], "far outside"),
     ([[0, 0, 1, "a", 2, 2]], r"polygon 0 with text \('a'\), expected .* without quotes"),
