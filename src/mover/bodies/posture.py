@@ -30,8 +30,9 @@ LONGEST_GAP = 1.0  # [s] between rows of a track that still give a speed
 Places = Float[Tensor, "bodies landmarks 3"]
 """Of `LANDMARKS` [m]."""
 Chance = Float[Tensor, "bodies verts"]
-Some = Float[Tensor, "bodies some"]  # of the vertices of a part
 """That a vertex touches something, and values like it."""
+Some = Float[Tensor, "bodies some"]
+"""The same of the vertices of a part."""
 
 
 @record

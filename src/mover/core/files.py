@@ -32,7 +32,7 @@ INSTEAD = {
     rb"\Z": "it is empty: copy or download it again",
 }
 """What a file may be instead of what was expected, by its first bytes."""
-PICKLES = (".pt", ".pth", ".pkl", ".pickle", ".joblib")
+PICKLES = (".pkl", ".pickle", ".joblib", ".pt", ".pth")
 KNOWN = {
     rb"PK\x03\x04|PK\x05\x06": ("it is a zip archive: unpack it", (".npz", *PICKLES)),
     rb"\x1f\x8b": ("it is packed by gzip: unpack it (gunzip)", PICKLES),

@@ -299,7 +299,8 @@ def _times(capture: Capture, found: agree.Agreement) -> Iterator[Fault]:
     masks = mask_boxes(people.masks)[rows]
     fits = iou2d(agree.in_image(found.boxes, capture.scene.camera).expand_as(masks), masks)
     best, change, late = 0.0, "", None
-    for who in (None, *bodies.person.unique().tolist()):  # all, then one alone
+    tracks = bodies.person.unique().tolist()
+    for who in (None, *tracks) if len(tracks) > 1 else (None,):  # all, then one alone
         mine = torch.ones_like(rows[0]).bool() if who is None else bodies.person == who
         both = (rows >= 0).where(mine, rows[0] >= 0)
         shared, total = both.sum(1), (both * fits.where(mine, fits[0])).sum(1)

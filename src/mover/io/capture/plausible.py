@@ -66,6 +66,11 @@ def check_plausible(capture: Capture, warn: Warn) -> None:
             warn(f"people.json: field 'info.heights' has the height of {unknown}")
 
 
+def _nearest_unit(factor: float) -> tuple[float, str]:
+    """How far off the nearest unit is (of the logarithm) if lengths are too large by a factor."""
+    return min((abs(math.log(k) - math.log(max(factor, 1e-9))), name) for name, k in UNITS.items())
+
+
 def _check_lens(camera: Camera, warn: Warn) -> None:
     """Pixels are square and the axis of the lens is near the middle, as cameras have it."""
     K, sides = camera.K, (camera.width, camera.height)
@@ -91,7 +96,7 @@ def _check_place(
     away, yaw = float(one.t_world_object.norm()), float(one.yaw)
     place, angle = name.format("translation"), name.format("yaw")
     if not away <= FARTHEST:
-        unit = min(UNITS, key=lambda name: abs(math.log(away / (ROOM * UNITS[name]))))
+        _, unit = _nearest_unit(away / ROOM)
         raise InputError(
             f"{place} is {away:.3g} m away, expected at most {FARTHEST:g} m; is it in {unit}?"
         )
@@ -119,9 +124,9 @@ def _check_size(
         advice = f", as its box at its distance implies about {implied:.2g}"
     is_odd = not 1 / OFF < ratio < OFF
     if is_odd:
-        unit = min(UNITS, key=lambda name: abs(math.log(UNITS[name] / ratio)))
+        off, unit = _nearest_unit(ratio)
         cure = f"multiply 'scale' by {1 / ratio:.2g}, or move it"
-        if 1 / 3 < UNITS[unit] / ratio < 3:
+        if off < math.log(3):
             cure = f"is its mesh in {unit}? Multiply 'scale' by {1 / UNITS[unit]:.4g}"
         advice += f": {cure}"
     found = f"{name.format('scale')} makes it {size:.3g} m large"
@@ -162,8 +167,8 @@ def check_bodies(bodies: Bodies, file: str, warn: Warn) -> None:
     middle = float(extent.median())
     field = f"{file}: field 'vertices'"
     if not SHORTEST <= middle <= LONGEST:
-        off = {abs(math.log(max(middle, 1e-9) / (USUAL * k))): name for name, k in UNITS.items()}
-        unit = f", as in {off[min(off)]}" if min(off) < 0.5 else ""
+        off, name = _nearest_unit(middle / USUAL)
+        unit = f", as in {name}" if off < 0.5 else ""
         raise InputError(
             f"{field} has bodies that measure {middle:.4g} across{unit}; are they in metres,"
             f" expected {SHORTEST:g} to {LONGEST:g} m?"

@@ -9,6 +9,7 @@ from typing import Any
 from msgspec import Struct, field
 
 from mover.core.errors import InputError
+from mover.core.files import PICKLES
 from mover.io.capture.parts import UNKNOWN, Hints, Parts
 from mover.io.files.fields import FASTEST, LAST_INDEX, SLOWEST, At, read_json
 from mover.io.files.images import image_size
@@ -25,7 +26,7 @@ from mover.io.masks.instances import (
     mask_code,
 )
 from mover.io.masks.label_images import PICTURES, pictures_in, read_label_images, read_mask_arrays
-from mover.io.people.values import PICKLES, lone, natural, number_in
+from mover.io.people.values import lone, natural, number_in
 
 LEAST_SCORE = 0.3  # of MMDetection, which writes everything that it thought of
 EXPORTS = {

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mover.core.errors import InputError
+from mover.core.files import PICKLES
 from mover.core.pickles import load_plain
 from mover.io.files.fields import (
     AMASS,
@@ -30,7 +31,6 @@ from mover.io.people.found import Known
 
 log = logging.getLogger(__name__)
 
-PICKLES = (".pkl", ".pickle", ".joblib", ".pt", ".pth")
 TREES = {".npz": read_npz, ".json": read_json}
 KINDS = (".npz", ".npy", *PICKLES, ".json")
 SHOWN_KEYS = 24
