@@ -27,7 +27,7 @@ TURN = math.pi / 4  # rears that are turned farther than this do not belong to a
 STRETCH = (0.7, 1.4)  # of its distance, within which an object is moved to a line
 BOTTOM = 3  # number of the side of a box on which the object stands
 ROUNDS = 2  # the lines run where the objects were found at first, then where these lines put them
-STILL = 0.03  # [m], lines that moved by less are not used once more
+STILL = 0.01  # [m], lines that moved by less are not used once more
 KEPT = 3  # candidates of the search without lines from which an object descends again
 
 
