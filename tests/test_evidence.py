@@ -1,12 +1,16 @@
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import tiny_capture as tiny
+import torch
 from scipy.ndimage import binary_erosion
 
-from mover.core.types import Capture
+from mover.core.types import Capture, Masks, People
+from mover.geometry.rle import encode
+from mover.io.capture import evidence
 from mover.io.capture.arrays import ObjectArrays, PeopleArrays, capture_from_arrays
 from mover.io.capture.evidence import BORDER, evidence_table, gather_evidence
 from mover.io.capture.folder import read_capture
@@ -70,6 +74,17 @@ def test_a_person_before_an_object_is_near_evidence_and_a_hidden_one_far(hide):
     assert lamp.missing == ("no person passes it",)
     assert (box.mask_pixels, box.missing) == (0, ("no mask, only a box",))
     assert guess.missing == ("no annotation",)
+
+
+def test_each_nth_frame_of_a_long_video_stands_for_n(monkeypatch):
+    code = encode(torch.from_numpy(disc(0.0)))
+    times, one = torch.arange(12), torch.zeros(12, dtype=torch.long)
+    people = People(Masks(HEIGHT, WIDTH, (code,) * 12), times, one)
+    capture = replace(room(hide=False), people=people)
+    whole = gather_evidence(capture)[0]
+    monkeypatch.setattr(evidence, "LOOKED", 6)
+    assert gather_evidence(capture)[0] == whole
+    assert whole.frames == 12
 
 
 def test_the_table_shows_every_object_and_every_warning():

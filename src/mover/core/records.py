@@ -51,7 +51,10 @@ def _kind(value: object) -> object:
     """All of a value that a check of a record looks at; None: its parts are looked at, too."""
     if isinstance(value, Tensor):
         return value.dtype, value.shape
-    simple = value is None or isinstance(value, (bool, int, float))
+    if type(value) is tuple and len(value) == 1:  # such as the mask of one annotation
+        kind = _kind(value[0])
+        return None if kind is None else (tuple, kind)
+    simple = value is None or isinstance(value, (bool, int, float, bytes))
     return type(value) if simple or dataclasses.is_dataclass(value) else None
 
 

@@ -64,7 +64,10 @@ def thinned(masks: Masks, index: int, step: int) -> NDArray[np.bool_]:
 
 def area(masks: Masks, index: int) -> int:
     """How many pixels of one of the masks are set."""
-    return int(run_lengths(masks.counts[index])[1::2].sum())
+    from pycocotools import mask as coco
+
+    code: Any = {"size": [masks.height, masks.width], "counts": masks.counts[index]}
+    return int(coco.area(code))
 
 
 def mask_boxes(masks: Masks) -> Float[Tensor, "masks 4"]:

@@ -55,12 +55,16 @@ SCORES = [field.name for field in fields(Agreement) if field.name != "boxes"]
 
 def thinned_capture(capture: Capture) -> Capture:
     """Few points, objects and bodies, enough for all outlines."""
-    scene, bodies = capture.scene, capture.bodies
+    scene, bodies, people = capture.scene, capture.bodies, capture.people
+    if people is not None and bodies is None:  # no time to compare
+        few = torch.linspace(0, len(people.frame) - 1, MOST_BODIES).long().unique()
+        people = rows_of(people, few)
     step = max(1, -(-len(scene.objects) // MOST_OBJECTS))
     objects = tuple(outermost(one) for one in scene.objects[::step])
     return replace(
         capture, scene=replace(scene, objects=objects), reference=None, touch=None, depth=None,
-        bodies=None if bodies is None else _few_points(bodies), hypotheses=(), furniture=None,
+        bodies=None if bodies is None else _few_points(bodies), people=people, hypotheses=(),
+        furniture=None,
     )  # fmt: skip
 
 

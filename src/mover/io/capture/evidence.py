@@ -22,6 +22,7 @@ FEWEST = 5  # touching vertices inside a mask that make a frame with contact
 UNSURE = 0.5  # chance from which on a vertex touches
 CELLS = 320  # columns of the grid on which overlaps are counted
 ENOUGH = 6000  # bodies with fewer vertices are filled with points between them
+LOOKED = 1000  # frames of people at most, evenly spread, in which they are looked at
 BORDER = 2  # cells of the grid beside an outline that are no evidence
 FEW = 50  # [px], less than that is hardly evidence
 Grid = NDArray[np.bool_]
@@ -76,9 +77,12 @@ def gather_evidence(capture: Capture) -> tuple[ObjectEvidence, ...]:
 def passing_people(
     capture: Capture, masks: Sequence[Masks | None]
 ) -> tuple[list[int], list[int], list[int]]:
-    """Of each object: pixels where people stand before it, where it hides them, and frames."""
+    """Of each object: pixels where people stand before it, where it hides them, and frames.
+
+    In a long video every n-th frame is looked at, and stands for n.
+    """
     camera, people, bodies = capture.scene.camera, capture.people, capture.bodies
-    if people is None:
+    if people is None or all(mask is None for mask in masks):
         return [0] * len(masks), [0] * len(masks), [0] * len(masks)
     step = max(1, camera.width // CELLS)
     shape = len(range(step // 2, camera.height, step)), len(range(step // 2, camera.width, step))
@@ -89,7 +93,9 @@ def passing_people(
     rows = [-1] * len(people.frame)
     if bodies is not None:
         rows = partners(people.frame, people.person, bodies).tolist()
-    for frame in people.frame.unique().tolist():
+    all_frames = people.frame.unique().tolist()
+    every = -(-len(all_frames) // LOOKED)
+    for frame in all_frames[::every]:
         shown = (people.frame == frame).nonzero()[:, 0].tolist()
         visible = [thinned(people.masks, i, step) for i in shown]
         hidden = _shrunk(~np.any(visible, axis=0))
@@ -106,7 +112,7 @@ def passing_people(
                 near[more > 0] |= layers[1]
                 far[more < 0] |= layers[2]
     pixels = (((found & grids).sum((1, 2)) * step**2).tolist() for found in (near, far))
-    return *pixels, [len(found) for found in frames]
+    return *pixels, [every * len(found) for found in frames]
 
 
 def contact_frames(capture: Capture, masks: Sequence[Masks | None]) -> list[int]:

@@ -33,6 +33,8 @@ GAPS = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)
 COCO_IDS = tuple(n for n in range(1, 91) if n not in GAPS)
 """COCO's own ids of its classes."""
 MOST_THINGS = 5000  # in one picture
+MOST_CODES = 200_000  # that were found right and are kept, some 400 bytes each
+_CODES = dict[tuple[str, tuple[int, int]], bytes]()
 CORNERS = 3  # a polygon has at least so many
 
 
@@ -62,18 +64,30 @@ def from_coco(at: At, height: int, width: int) -> bytes:
     if not isinstance(segmentation, dict):
         kinds = "polygons [[x, y, ...], ...] or a run-length code {size, counts}"
         at.refuse(kinds, type(segmentation).__name__)
-    size, counts = segmentation.get("size"), segmentation.get("counts")
+    return _run_code(segmentation, (height, width), at)
+
+
+def _run_code(given: dict[str, Any], whole: tuple[int, int], at: At) -> bytes:
+    """The compressed code of either run-length code, checked once for each text."""
+    from pycocotools import mask as coco
+
+    size, counts = given.get("size"), given.get("counts")
     size = _unprinted(size, size) if isinstance(size, str) else size
-    if not isinstance(size, list | tuple) or tuple(size) != (height, width):
-        at.refuse(f"[{height}, {width}] (h, w)", f"size {str(size)[:40]}")
+    if not isinstance(size, list | tuple) or tuple(size) != whole:
+        at.refuse(f"{list(whole)} (h, w)", f"size {str(size)[:40]}")
+    if isinstance(counts, str) and (counts, whole) in _CODES:
+        return _CODES[counts, whole]
     runs = _runs(counts, at)
-    if (runs < 0).any() or runs.sum() != height * width:
+    if (runs < 0).any() or runs.sum() != whole[0] * whole[1]:
         found = f"runs that sum to {runs.sum()}" if (runs >= 0).all() else "a negative run"
-        at.refuse(f"runs that sum to {height} x {width}", f"counts with {found}")
+        at.refuse(f"runs that sum to {whole[0]} x {whole[1]}", f"counts with {found}")
     if isinstance(counts, bytes):
         return counts
-    code: Any = {"size": [height, width], "counts": [int(n) for n in runs]}
-    return coco.frPyObjects(code, height, width)["counts"]  # pyright: ignore
+    tree: Any = {"size": list(whole), "counts": runs.tolist()}
+    code: bytes = coco.frPyObjects(tree, *whole)["counts"]  # pyright: ignore
+    if isinstance(counts, str) and len(_CODES) < MOST_CODES:  # a file is read to be merged, again
+        _CODES[counts, whole] = code
+    return code
 
 
 def _unprinted(written: str, other: Any) -> Any:  # noqa: ANN401
