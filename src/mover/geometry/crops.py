@@ -1,8 +1,10 @@
 """Square windows of an image, exact means of image areas in them, distances in masks."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mover.geometry.camera import at_pixels
@@ -34,27 +36,59 @@ def grid_in_image(views: Crops, K: Float[Tensor, "3 3"]) -> tuple[Tensor, Tensor
     return x, y
 
 
+Region = tuple[slice, slice]  #: rows and columns of an image
+
+
+def regions(
+    center: Float[Tensor, "items 2"], reach: Float[Tensor, " items"], size: tuple[int, int]
+) -> list[Region]:
+    """What squares need of an image of this `size` (h, w): two rows and columns at least."""
+    most = torch.tensor(size[::-1])
+    low = (center - reach[:, None]).floor().long().clamp_min(0).minimum(most - 2)
+    high = (center + reach[:, None]).ceil().long().minimum(most).maximum(low + 2)
+    ends = zip(low.tolist(), high.tolist(), strict=True)
+    return [(slice(y, bottom), slice(x, right)) for (x, y), (right, bottom) in ends]
+
+
 def area_mean(
-    images: Float[Tensor, "items h w"], views: Crops, K: Float[Tensor, "3 3"]
+    images: Sequence[Bool[Tensor, "rows columns"]],
+    at: Sequence[Region],
+    views: Crops,
+    K: Float[Tensor, "3 3"],
 ) -> Float[Tensor, "items wh ww"]:
-    """Exact mean of each image over each pixel of its window; zero outside the image."""
-    height, width = images.shape[-2:]
-    total = torch.nn.functional.pad(images.double().cumsum(-1).cumsum(-2), (1, 0, 1, 0))
+    """Exact mean of each mask over each pixel of its window; zero outside the image.
+
+    Of each mask there is the region that the window needs.
+    """
     x, y = grid_in_image(views, K)
-    rows = _between(total, y.double().clamp(0, height))
-    sums = _between(rows.mT, x.double().clamp(0, width)).mT
-    area = (x[:, 1:] - x[:, :-1]).unsqueeze(-2) * (y[:, 1:] - y[:, :-1]).unsqueeze(-1)
-    return (sums.diff(dim=-1).diff(dim=-2) / area).to(images).clamp(0, 1)
+    found: list[Tensor] = []
+    for image, (rows, columns), across, down in zip(images, at, x, y, strict=True):
+        total = image.double().cumsum(-1).cumsum(-2)
+        total = torch.nn.functional.pad(total, (1, 0, 1, 0))
+        lines = _between(total, (down.double() - rows.start).clamp(0, image.shape[0]))
+        sums = _between(lines.mT, (across.double() - columns.start).clamp(0, image.shape[1])).mT
+        area = across.diff() * down.diff().unsqueeze(-1)
+        found.append((sums.diff(dim=-1).diff(dim=-2) / area).float().clamp(0, 1))
+    return torch.stack(found) if found else views.K.new_zeros(0, views.height, views.width)
+
+
+def share_inside(
+    views: Crops, K: Float[Tensor, "3 3"], size: tuple[int, int]
+) -> Float[Tensor, "items wh ww"]:
+    """Share of each pixel of the windows that lies in an image of this `size` (h, w)."""
+    x, y = grid_in_image(views, K)
+    across, down = ((line.clamp(0, most).diff() / line.diff())
+                    for line, most in ((x, size[1]), (y, size[0])))  # fmt: skip
+    return across.unsqueeze(-2) * down.unsqueeze(-1)
 
 
 def _between(
-    table: Float[Tensor, "items rows columns"], at: Float[Tensor, "items lines"]
-) -> Float[Tensor, "items lines columns"]:
+    table: Float[Tensor, "rows columns"], at: Float[Tensor, " lines"]
+) -> Float[Tensor, "lines columns"]:
     """Rows of a table at fractional places, interpolated."""
-    low = at.floor().long().clamp(0, table.shape[-2] - 2)
+    low = at.floor().long().clamp(0, len(table) - 2)
     share = (at - low).unsqueeze(-1)
-    index = low.unsqueeze(-1).expand(-1, -1, table.shape[-1])
-    return table.gather(-2, index) * (1 - share) + table.gather(-2, index + 1) * share
+    return table[low] * (1 - share) + table[low + 1] * share
 
 
 def sample_nearest(

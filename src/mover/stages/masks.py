@@ -95,7 +95,6 @@ def compare_extents(
     Returns:
         None if no person is seen wholly, upright and high enough.
     """
-    views = Crops(camera.K[None].float(), camera.height, camera.width)
 
     def ratio(row: int) -> float:
         """Height of the body over that of its mask; NaN where they constrain nothing."""
@@ -104,12 +103,17 @@ def compare_extents(
         last = pixels.new_tensor([camera.width - 2, camera.height - 2])
         if not bool((verts[:, 2] > 0).all() & ((pixels > 2) & (pixels < last)).all()):
             return math.nan
+        (x, y), (right, bottom) = pixels.amin(0).long().tolist(), pixels.amax(0).long().tolist()
+        at = slice(y - 1, bottom + 2), slice(x - 1, right + 2)  # nothing else is looked at
+        K = camera.K.float().clone()
+        K[:2, 2] -= K.new_tensor([x - 1, y - 1])
+        views = Crops(K[None], bottom - y + 3, right - x + 3)
         drawn = fronts(verts[None].float(), bodies.faces, views).isfinite()[0]
         high, wide = _extent(drawn)
         if high <= UPRIGHT * wide:
             return math.nan
         own, others = table.decode(row)
-        covered = drawn & (blocked(int(bodies.frame[row])) | others) & ~own
+        covered = drawn & (blocked(int(bodies.frame[row]))[at] | others[at]) & ~own[at]
         if covered.sum() > WHOLE * drawn.sum() or min(high, _extent(own)[0]) < HIGH:
             return math.nan
         body, mask = high - _thick(drawn), _extent(own)[0] - _thick(own)

@@ -1,5 +1,7 @@
 """What the clean image says about each object: its box, its mask, and what is unknown."""
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -9,7 +11,7 @@ from mover.core.records import record
 from mover.core.types import Camera, Capture, Masks
 from mover.energy.image_terms import LEAST, LIKELY, SEEN, UNKNOWN, borders_of
 from mover.energy.objective import ImageCues
-from mover.geometry.crops import area_mean, crop_views
+from mover.geometry.crops import Region, area_mean, crop_views, regions, share_inside
 from mover.geometry.rle import decode
 from mover.geometry.warp_start import mapped
 from mover.stages.config import ImageConfig
@@ -94,22 +96,26 @@ def find_image_cues(
 ) -> ImageCues:
     """Cut a square window around each box; mark what other objects, people or the border hide."""
     del observe
-    views = crop_views(inputs.camera.K, inputs.boxes, MARGIN, config.size)
-    others = _others(inputs)
-    own, hidden, inside = mapped(
-        lambda masks: area_mean(masks.float(), views, inputs.camera.K),
-        [inputs.masks, others, torch.ones_like(inputs.masks)],
-    )
-    inside = inside > 0.999
+    K, size = inputs.camera.K, (inputs.camera.height, inputs.camera.width)
+    views = crop_views(K, inputs.boxes, MARGIN, config.size)
+    center = (inputs.boxes[:, :2] + inputs.boxes[:, 2:]) / 2
+    side = (inputs.boxes[:, 2:] - inputs.boxes[:, :2]).amax(-1).clamp_min(2)
+    strip = _strip_depth(inputs.boxes).clamp_min(GAP * inputs.camera.width)
+    reach = 1 + (side * (1 + MARGIN) / 2).maximum(side / 2 + strip)
+    at = regions(center, reach, size)  # nothing else of the picture is looked at
+    others = _others(inputs, at)
+    masks = [mask[region] for mask, region in zip(inputs.masks, at, strict=True)]
+    own, hidden = mapped(lambda images: area_mean(images, at, views, K), [masks, others])
+    inside = share_inside(views, K, size) > 0.999
     known = inputs.masks.any(-1).any(-1)[:, None, None]
     keep = (hidden < 1e-6) & inside & known
     sides = torch.where(inputs.seen, SEEN, UNKNOWN).unsqueeze(-1).expand(-1, 4)
     beside = borders = None
     if config.form == "robust":
-        touched = _beside(inputs, others, 0.0)
+        touched = _beside(inputs, others, at, 0.0)
         sides = torch.where(sides == SEEN, _sides(inputs, touched, config), sides)
         if config.bounded:
-            near = _beside(inputs, others, GAP * inputs.camera.width)
+            near = _beside(inputs, others, at, GAP * inputs.camera.width)
             beside = torch.stack([touched, near], -1)
     if config.borders:
         zoom = views.K[:, 0, 0] / inputs.camera.K[0, 0]
@@ -120,15 +126,16 @@ def find_image_cues(
     )  # fmt: skip
 
 
-def _others(inputs: ImageInputs) -> Bool[Tensor, "objects h w"]:
-    """Pixels where something else is seen that may hide this object."""
-    rows: list[Tensor] = []
-    for i in range(len(inputs.masks)):  # a loop keeps the memory at one image
-        rivals = ~inputs.behind[i]
-        rivals[i] = False
-        seen = inputs.masks[rivals].any(0) if rivals.any() else torch.zeros_like(inputs.people)
-        rows.append((seen | inputs.people) & ~inputs.masks[i])
-    return torch.stack(rows)
+def _others(inputs: ImageInputs, at: Sequence[Region]) -> list[Bool[Tensor, "_ _"]]:
+    """Pixels of each object's region where something else is seen that may hide it."""
+    found: list[Tensor] = []
+    for i, region in enumerate(at):
+        seen = inputs.people[region].clone()
+        for j in (~inputs.behind[i]).nonzero()[:, 0].tolist():
+            if j != i:
+                seen |= inputs.masks[j][region]
+        found.append(seen & ~inputs.masks[i][region])
+    return found
 
 
 def _sides(
@@ -145,27 +152,31 @@ def _sides(
     return torch.where(inside, torch.where(free, SEEN, LIKELY if config.bounded else LEAST), LEAST)
 
 
+def _strip_depth(boxes: Float[Tensor, "*items 4"]) -> Float[Tensor, "*items"]:
+    """How far beyond a side one looks for what may hide it [px]."""
+    return STRIP * (boxes[..., 2:] - boxes[..., :2]).clamp_min(1).prod(-1).sqrt().clamp_min(2)
+
+
 def _beside(
-    inputs: ImageInputs, others: Bool[Tensor, "objects h w"], gap: float
+    inputs: ImageInputs, others: Sequence[Bool[Tensor, "_ _"]], at: Sequence[Region], gap: float
 ) -> Float[Tensor, "objects 4"]:
     """Share of the strip beyond each side of the boxes in which something else is seen.
 
     With a gap, the least width of the strip [px]: share of the side that something is near to.
     """
     rows: list[Tensor] = []
-    height, width = others.shape[-2:]
-    for own, box in zip(others, inputs.boxes, strict=True):
-        depth = STRIP * (box[2:] - box[:2]).clamp_min(1).prod().sqrt().clamp_min(2)
-        depth = depth.clamp_min(gap)
+    height, width = inputs.camera.height, inputs.camera.width
+    for own, (down, across), box in zip(others, at, inputs.boxes, strict=True):
+        depth = _strip_depth(box).clamp_min(gap)
         for side in range(4):  # left, top, right, bottom
             axis, strip = side % 2, box.clone()
             strip[axis], strip[axis + 2] = (
                 (box[axis] - depth, box[axis]) if side < 2 else (box[side], box[side] + depth)
             )
             x0, y0, x1, y1 = (round(v) for v in strip.tolist())
-            part = own[
-                max(0, y0) : min(height, max(y1, y0 + 1)), max(0, x0) : min(width, max(x1, x0 + 1))
-            ]
+            low, high = max(0, y0) - down.start, min(height, max(y1, y0 + 1)) - down.start
+            first, last = max(0, x0) - across.start, min(width, max(x1, x0 + 1)) - across.start
+            part = own[max(0, low) : max(0, high), max(0, first) : max(0, last)]
             if gap:
                 part = part.any(1 - axis) if part.numel() else part
             rows.append(part.float().mean() if part.numel() else torch.zeros(()))

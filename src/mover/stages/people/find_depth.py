@@ -28,6 +28,7 @@ from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
 from mover.core.types import Bodies, Camera, People
 from mover.geometry.camera import project
+from mover.geometry.path import is_still
 from mover.geometry.raster import Crops, fronts
 from mover.geometry.warp_start import mapped
 from mover.stages.camera.find_foot_contacts import straight_legs
@@ -142,7 +143,8 @@ def find_depth(
     found = torch.ones(3, len(tracks))
     table = mask_table(inputs.people, bodies)
     blocked = covered(inputs.objects)
-    free = cache(lambda frame: uncovered(blocked(frame), config.width))
+    each = cache(lambda frame: uncovered(blocked(frame), config.width))
+    free = (lambda _: each(0)) if is_still(inputs.objects.path) else each
     for index, person in enumerate(tracks):  # each has its own frames
         rows = ((bodies.person == person) & inputs.keep).nonzero()[:, 0]
         size, note = _size(inputs, rows, str(person))
@@ -265,7 +267,7 @@ def _curves(
     def curve(row: int) -> Tensor | None:
         own, others = table.decode(row)
         free = free_in(int(inputs.bodies.frame[row]))
-        known = free & uncovered(others, config.width)
+        known = free & uncovered(others, config.width) if table.others[row] else free
         mask = small(own, config.width)
         middle = _drawn(inputs, row, free, torch.ones(1))[0]
         seen = mask[middle & known].sum() / (middle & known).sum().clamp_min(1)
