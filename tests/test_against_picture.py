@@ -66,6 +66,15 @@ def test_what_lies_on_its_picture_has_no_fault(right):
     assert check_against_picture(right).warnings == ()
 
 
+def test_it_is_said_that_bodies_without_masks_are_held_against_nothing(right):
+    said = "bodies could not be held against the picture"
+    whole, bare, alone = (
+        check_against_picture(capture).summary
+        for capture in (right, replace(right, people=None), replace(right, bodies=None))
+    )
+    assert [any(said in line for line in lines) for lines in (whole, bare, alone)] == [0, 1, 0]
+
+
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_fault_is_named_and_mended(right, name):
     words, change = FAULTS[name]

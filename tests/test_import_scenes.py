@@ -195,6 +195,15 @@ def test_boxes_come_back_with_furniture_of_their_class(plain, tmp_path, frame):
     assert all(p.annotation is not None for p in found.scene.objects)
 
 
+def test_a_list_of_boxes_alone_is_that_of_the_objects(plain, tmp_path):
+    source = layouts.write_boxes(tmp_path / "in.json", plain)
+    source.write_text(json.dumps(json.loads(source.read_text())["objects"]))
+    found = imported("boxes", source, tmp_path / "out", tmp_path, camera=camera_at(plain)).capture
+    for piece, thing in zip(found.scene.objects, plain.things, strict=True):
+        assert np.allclose(box_of(piece).center.numpy(), thing.centre, atol=FINE)
+        assert np.allclose(box_of(piece).size.numpy(), thing.size, atol=FINE)
+
+
 def test_a_tilted_object_stands_upright_about_its_centre(plain, tmp_path):
     tilt = layouts.Rotation.from_euler("x", 8, degrees=True).as_matrix()
     source = layouts.write_glb(tmp_path / "in.glb", plain, layouts.four(tilt), camera=False)

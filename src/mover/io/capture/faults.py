@@ -79,8 +79,12 @@ class Findings:
         """How far outlines and masks share the picture, as they are given."""
         known = {"objects and their annotations": self.agreement.objects,
                  "bodies and their masks": self.agreement.people}  # fmt: skip
-        return tuple(f"in the picture, {name} share {100 * mean(score):.0f} % of their boxes"
-                     for name, score in known.items() if not bool(score.isnan().all()))  # fmt: skip
+        lines = [f"in the picture, {name} share {100 * mean(score):.0f} % of their boxes"
+                 for name, score in known.items() if not bool(score.isnan().all())]  # fmt: skip
+        if len(self.agreement.heights) and bool(self.agreement.people.isnan().all()):
+            lines.append("bodies could not be held against the picture, as there are no masks of"
+                         " people: their times, their lens, their left and right")  # fmt: skip
+        return tuple(lines)
 
 
 def check_against_picture(capture: Capture) -> Findings:

@@ -233,8 +233,9 @@ class BoxesFields(Struct, frozen=True):
 
 
 def box_parts(path: Path, hints: Hints) -> Parts:
-    """Furniture in boxes."""
+    """Furniture in boxes: the whole file, or the list of its objects alone."""
     at = read_json(path)
+    at = at.holding({"objects": at.value}) if isinstance(at.value, list) else at
     tree = checked(at, BoxesFields)
     camera = hints.camera
     if camera is None and tree.camera is not None:
