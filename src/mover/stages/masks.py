@@ -106,8 +106,8 @@ def compare_extents(
         (x, y), (right, bottom) = pixels.amin(0).long().tolist(), pixels.amax(0).long().tolist()
         at = slice(y - 1, bottom + 2), slice(x - 1, right + 2)  # nothing else is looked at
         K = camera.K.float().clone()
-        K[:2, 2] -= K.new_tensor([x - 1, y - 1])
-        views = Crops(K[None], bottom - y + 3, right - x + 3)
+        K[:2, 2] -= K.new_tensor([at[1].start, at[0].start])
+        views = Crops(K[None], *(span.stop - span.start for span in at))
         drawn = fronts(verts[None].float(), bodies.faces, views).isfinite()[0]
         high, wide = _extent(drawn)
         if high <= UPRIGHT * wide:

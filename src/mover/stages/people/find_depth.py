@@ -28,7 +28,6 @@ from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
 from mover.core.types import Bodies, Camera, People
 from mover.geometry.camera import project
-from mover.geometry.path import is_still
 from mover.geometry.raster import Crops, fronts
 from mover.geometry.warp_start import mapped
 from mover.stages.camera.find_foot_contacts import straight_legs
@@ -143,8 +142,11 @@ def find_depth(
     found = torch.ones(3, len(tracks))
     table = mask_table(inputs.people, bodies)
     blocked = covered(inputs.objects)
-    each = cache(lambda frame: uncovered(blocked(frame), config.width))
-    free = (lambda _: each(0)) if is_still(inputs.objects.path) else each
+    made_small = cache(lambda mask: uncovered(mask, config.width))  # one for a still camera
+
+    def free(frame: int) -> Tensor:
+        return made_small(blocked(frame))
+
     for index, person in enumerate(tracks):  # each has its own frames
         rows = ((bodies.person == person) & inputs.keep).nonzero()[:, 0]
         size, note = _size(inputs, rows, str(person))
