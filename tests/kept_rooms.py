@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
+from mover.core.files import sources
 from mover.core.observe import Observer, silent
 from mover.core.records import rows_of
-from mover.core.run import Run, sources
+from mover.core.run import Run
 from mover.core.types import Bodies, Capture, People
 from mover_bench.rooms.config import RoomConfig
 from mover_bench.rooms.known import KnownRoom, demo_room, make_room

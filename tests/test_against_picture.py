@@ -9,9 +9,9 @@ import pytest
 import torch
 from little_room import room, walkers
 
-from mover.core.types import Bodies, Capture, Detection, Masks, People, Tilt
+from mover.core.types import Bodies, Capture, Detection, Keypoints, Masks, People, Tilt
 from mover.geometry.camera import pitch_roll, tilted, to_camera
-from mover.geometry.rle import encode
+from mover.geometry.rle import encode, mask_boxes
 from mover.io.capture.agreement import (
     agreement,
     box_around,
@@ -82,7 +82,8 @@ def test_a_fault_is_named_and_mended(right, name):
     if harmed is None:
         pytest.skip("this room has nothing that shows it")
     findings = check_against_picture(harmed)
-    assert any(words in text for text in findings.warnings), findings.warnings
+    named = (one in text for text in findings.warnings for one in words.split("|"))
+    assert any(named), findings.warnings
     for fault in findings.faults:
         harmed = fault.mend(harmed)
     mended = agreement(thinned_capture(harmed))
@@ -116,6 +117,70 @@ def test_parts_of_different_pictures_and_nothing_to_compare_are_said(right):
     bare = replace(right, detections=(), people=None)
     (said,) = check_against_picture(bare).warnings
     assert "nothing could be held against the picture" in said
+
+
+OF_BODIES = [name for name in FAULTS if name.startswith("bodies")]
+
+
+def with_joints(capture: Capture, track: int = 0) -> Capture:
+    """Joints in place of masks: corners of the boxes less their skin."""
+    boxes, frame = mask_boxes(capture.people.masks), capture.people.frame
+    low, high = boxes.float().split(2, 1)
+    side = (high - low).amax(1, keepdim=True)
+    low, high = low + side * torch.tensor([0.05, 0.08]), high - side * 0.05
+    points = torch.zeros(len(frame), 17, 2)
+    points[:, 5:9] = torch.stack([low, high, (low + high) / 2, low], 1)
+    sure = torch.zeros(len(frame), 17)
+    sure[:, 5:9] = 0.9
+    keypoints = Keypoints(points, sure, "coco17", frame, capture.people.person + track, 15.0)
+    return replace(capture, people=None, keypoints=keypoints)
+
+
+def test_bodies_on_their_keypoints_have_no_fault(right):
+    findings = check_against_picture(with_joints(right, 7))
+    assert findings.warnings == ()
+    (said,) = [text for text in findings.summary if "bodies" in text]
+    assert "bodies and their keypoints share 9" in said
+
+
+@pytest.mark.parametrize("name", OF_BODIES)
+def test_without_masks_keypoints_show_the_faults_of_bodies(right, name):
+    words, change = FAULTS[name]
+    findings = check_against_picture(change(with_joints(right)))
+    said = [text for text in findings.warnings for one in words.split("|") if one in text]
+    assert said, findings.warnings
+    assert "mask" not in said[0]
+
+
+def test_keypoints_of_a_folder_are_read_where_there_are_no_masks(right, tmp_path):
+    given = with_joints(right)
+    write_capture(given, tmp_path / "one")
+    found = read_capture(tmp_path / "one").keypoints
+    assert torch.equal(found.points, given.keypoints.points)
+    assert torch.equal(found.person, given.keypoints.person)
+    write_capture(replace(given, people=right.people), tmp_path / "both")
+    assert read_capture(tmp_path / "both").keypoints is None  # masks show more
+    triples = torch.cat([given.keypoints.points, given.keypoints.confidence[..., None]], -1)
+    write_capture(replace(given, keypoints=None), tmp_path / "folder")
+    for frame in given.keypoints.frame.unique().tolist():
+        rows = triples[given.keypoints.frame == frame]
+        people = [{"pose_keypoints_2d": [*row.flatten().tolist(), *([0.0] * 24)]} for row in rows]
+        path = tmp_path / "folder" / "keypoints" / f"{frame:06d}_keypoints.json"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(json.dumps({"people": people}))
+    capture = read_capture(tmp_path / "folder")
+    assert capture.keypoints.layout == "openpose25"
+    late = FAULTS["bodies 2 frames early"][1](capture)
+    assert any("2 frames early" in text for text in check_against_picture(late).warnings)
+
+
+def test_unreadable_keypoints_are_said_and_stop_nothing(right, tmp_path):
+    write_capture(replace(right, people=None), tmp_path)
+    (tmp_path / "keypoints.npz").write_text("no archive")
+    capture = read_capture(tmp_path)
+    assert capture.keypoints is None
+    (said,) = [text for text in capture.warnings if "keypoints.npz" in text]
+    assert said.endswith("bodies are not held against it")
 
 
 def test_a_mended_capture_is_written_beside_the_given_one(right, tmp_path):

@@ -20,12 +20,12 @@ from mover.app.batch import (
     RayOptions,
     captures_in,
     earlier,
-    fingerprint,
     names_of,
     run_batch,
     run_job,
 )
 from mover.core.errors import InputError
+from mover.core.files import fingerprint
 
 REFUSED = "mover run: camera.json: field 'w' has 0, expected a number above 0"
 FAKE = """

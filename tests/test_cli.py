@@ -13,6 +13,7 @@ import pytest
 import tiny_capture
 
 from mover.app import cli
+from mover.app.cli import run as run_module
 from mover.app.cli.run import parse_run
 from mover.pipeline.presets import PRESETS
 
@@ -36,6 +37,55 @@ def test_ctrl_c_ends_a_run_at_once_and_the_same_command_goes_on(folder, tmp_path
     kept = {path: path.stat().st_mtime_ns for path in stages.rglob("*.json")}
     assert subprocess.run(command, capture_output=True).returncode == 0
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
+
+
+AGAIN = """
+import sys
+from mover.app.cli import run_command
+
+code = run_command("run", sys.argv[1:])
+assert "torch" not in sys.modules
+raise SystemExit(code)
+"""
+
+
+@pytest.mark.slow
+def test_a_finished_result_is_not_made_again_until_something_changes(
+    folder, tmp_path, capsys, monkeypatch
+):
+    out, again = tmp_path / "out", "has the result of this capture and these settings already"
+    words = [str(folder), "--out", str(out), "--place.method.steps", "20"]
+
+    def times() -> dict[Path, int]:
+        return {path: path.stat().st_mtime_ns for path in out.rglob("*")}
+
+    assert cli.run_command("run", words) == 0
+    first, before = capsys.readouterr().out, times()
+    found = subprocess.run([sys.executable, "-c", AGAIN, *words], capture_output=True, text=True)
+    assert (found.returncode, found.stderr) == (0, "")
+    assert again in found.stdout
+    assert times() == before
+    assert [line for line in first.splitlines() if line.startswith("warning")] == [
+        line for line in found.stdout.splitlines() if line.startswith("warning")
+    ]
+
+    made: list[Path] = []
+
+    def make(out: Path, *_: object) -> None:
+        made.append(out)
+        (out / "report.html").write_text("a page")
+
+    monkeypatch.setattr(run_module, "reconstruct_into", make)
+    changes = (
+        lambda: os.utime(folder / "scene.json"), lambda: (out / "scene.json").write_text("{}"),
+        (out / "report.html").unlink, lambda: words.extend(["--device", "auto"]),
+    )  # fmt: skip
+    for count, change in enumerate(changes, 1):
+        change()
+        for _ in range(2):
+            assert cli.run_command("run", words) == 0
+            assert len(made) == count
+        assert again in capsys.readouterr().out
 
 
 def command_that(body: str) -> list[str]:

@@ -151,6 +151,7 @@ def test_seeds_are_numbers_and_ranges_in_order_and_anything_else_is_refused() ->
             parse_seeds(text)
 
 
+@pytest.mark.slow
 def test_every_room_is_done_once_and_a_second_pass_does_nothing(finished) -> None:
     args, steps, here = finished
     assert here.seeds == [0, 1]
@@ -164,6 +165,7 @@ def test_every_room_is_done_once_and_a_second_pass_does_nothing(finished) -> Non
     assert not list(args.out.rglob("stages"))
 
 
+@pytest.mark.slow
 def test_results_hold_every_object_of_every_stage_and_the_initial_row_is_moved_by_the_noise(
     finished,
 ) -> None:
@@ -185,6 +187,7 @@ def test_results_hold_every_object_of_every_stage_and_the_initial_row_is_moved_b
             assert float(row["center_error"]) == pytest.approx(shift, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_the_page_has_the_means_and_differences_of_the_files(finished) -> None:
     args, _, _ = finished
     page = (args.out / "rooms" / "summary.md").read_text()
@@ -212,6 +215,7 @@ def test_the_page_has_the_means_and_differences_of_the_files(finished) -> None:
     assert "mover experiment --set rooms --seeds 0,1 --variants robust paper no-people" in page
 
 
+@pytest.mark.slow
 def test_stages_share_a_camera_and_people_who_are_withheld_are_measured_all_the_same(finished):
     paper, alone = (
         json.loads((finished[0].out / "rooms" / "0" / f"{name}.json").read_text())
@@ -224,6 +228,7 @@ def test_stages_share_a_camera_and_people_who_are_withheld_are_measured_all_the_
     assert "contact_f1" in alone["full"]
 
 
+@pytest.mark.slow
 def test_a_variant_that_fails_is_named_and_done_again_by_the_next_pass(patched, tmp_path):
     args = ExperimentArgs("0", ("robust", "paper"), tmp_path)
     with patched.context() as patch:
@@ -240,6 +245,7 @@ def test_a_variant_that_fails_is_named_and_done_again_by_the_next_pass(patched, 
     assert again.seeds == [0]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("patched")
 def test_a_result_of_other_sources_is_done_again(finished, tmp_path) -> None:
     args = replace(finished[0], out=tmp_path, seeds="0", variants=("robust",))
@@ -253,6 +259,7 @@ def test_a_result_of_other_sources_is_done_again(finished, tmp_path) -> None:
         assert here.seeds == done
 
 
+@pytest.mark.slow
 def test_refined_people_change_what_is_measured_of_people_only(tmp_path, monkeypatch) -> None:
     def sunk(room, _capture, _config):
         down = torch.tensor([0.0, -0.05, 0.0])

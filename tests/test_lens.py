@@ -104,9 +104,10 @@ def lens_of(segments: Segments, focal: float, spread: float | None):
 
 @pytest.mark.parametrize(
     ("off", "heading"),
-    [(0.93, 0.0), (1.0, 0.3), (1.07, 0.7),
+    [(1.07, 0.7),
      *(pytest.param(*one, marks=pytest.mark.slow) for one in (
-         (1.0, 0.0), (1.07, 0.0), (0.93, 0.3), (1.07, 0.3), (0.93, 0.7), (1.0, 0.7)))],
+         (0.93, 0.0), (1.0, 0.3), (1.0, 0.0), (1.07, 0.0), (0.93, 0.3), (1.07, 0.3), (0.93, 0.7),
+         (1.0, 0.7)))],
 )  # fmt: skip
 def test_a_guessed_lens_is_found_from_boxes_that_stand_along_a_room(off: float, heading: float):
     found = lens_of(drawn(heading, seed=3, askew=2), off * FOCAL, 0.055)
@@ -130,11 +131,11 @@ def test_the_stated_error_holds():
     assert math.sqrt(np.mean(np.square(off))) < 1.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("off", "count"),
-    [((3.0, 8.0), 3), *(pytest.param(off, 12, marks=pytest.mark.slow)
-                        for off in ((0.0, 0.0), (3.0, 8.0), (3.0, 15.0)))],
-)  # fmt: skip
+    [((3.0, 8.0), 3), ((0.0, 0.0), 12), ((3.0, 8.0), 12), ((3.0, 15.0), 12)],
+)
 def test_right_angles_of_each_object_give_the_lens_wherever_it_is_turned(off, count):
     errors, spreads = [], []
     for seed in range(count):

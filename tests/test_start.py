@@ -46,6 +46,7 @@ def said(code: str, **env: str) -> str:
     return done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_threads_that_start_at_once_initialise_warp_once_and_say_nothing():
     assert said(RACE) == ""
 

@@ -27,10 +27,10 @@ from mover import __version__
 from mover.app.batch import read_tree
 from mover.core import records
 from mover.core.errors import InputError
-from mover.core.files import replacing
+from mover.core.files import replacing, sources
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
-from mover.core.run import Run, sources
+from mover.core.run import Run
 from mover.core.types import Bodies, Camera, Capture, Room, Scene, SceneObject
 from mover.evaluate.bodies import shared_rows
 from mover.evaluate.evaluation import EvaluateConfig, EvaluatedBodies, evaluate

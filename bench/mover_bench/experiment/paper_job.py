@@ -22,9 +22,9 @@ import torch
 
 from mover.core.devices import Choice, device_of
 from mover.core.errors import InputError
-from mover.core.files import replacing
+from mover.core.files import replacing, sources
 from mover.core.records import fingerprint
-from mover.core.run import Run, sources
+from mover.core.run import Run
 from mover.core.types import Bodies, Capture, Scene, SceneObject
 from mover.evaluate.bodies import shared_rows
 from mover.evaluate.evaluation import EvaluateConfig, EvaluatedBodies, evaluate, read_truth

@@ -8,6 +8,7 @@ of all rooms: people are as tall as people are, furniture as large as its class;
 along a wall; skin rests on seats and soles on the floor; furniture covers its outline.
 """
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -53,6 +54,7 @@ from mover_bench.cli import ExperimentArgs
 from mover_bench.datasets.i3db import I3dbScene, read_i3db
 from mover_bench.experiment.tables import judge_each, markdown
 
+log = logging.getLogger(__name__)
 VIEW = 65.0  # [degrees], horizontal, of a clip whose lens was not measured
 STEP_UP = 0.15  # [m] that a seat may reach into its sitter and still be below
 LOWEST = 0.1  # of the skin over a seat that may be in it: a mattress gives way
@@ -240,28 +242,37 @@ def i3db_table(found: dict[str, dict[str, Any]]) -> str:
 
 
 def judge_scene(scene: I3dbScene, run: Run, preset: str) -> dict[str, Any]:
-    """Fit the people, find a first scene, reconstruct both starts, compare with the truth."""
-    camera = replace(scene.truth.camera, R_cam_world=LEVEL)  # its tilt is not given
-    model = open_body()
-    bodies = fit_bodies(FitInputs(scene.keypoints, camera, model)).bodies
-    tall = None if bodies.pose is None else statures(bodies.pose)
+    """Reconstruct a scene from both starts, and compare with the truth."""
+    starts = starts_of(scene, run)
+    bodies = starts[0].bodies
+    tall = None if bodies is None or bodies.pose is None else statures(bodies.pose)
     assert tall is not None, "of the open body"
+    numbers: dict[str, Any] = {
+        "stature": float(tall[0]),
+        **overlaps("imapper", by_kind(scene.imapper, scene.truth.objects), scene),
+    }
+    for start, name, result in zip(starts, ("first", "given"), ("run", "run_given"), strict=True):
+        numbers |= overlaps(name, start.scene.objects, scene)
+        try:
+            found = reconstruct(start, PRESETS[preset], run).scene
+        except InputError as error:  # such as a floor above the camera
+            log.warning("%s, %s: %s; it counts 0", scene.name, result, error)
+            found = Scene(start.scene.camera, math.nan, ())
+        numbers |= overlaps(result, found.objects, scene)
+        numbers |= camera_errors(result, found, scene.truth)
+    return numbers
+
+
+def starts_of(scene: I3dbScene, run: Run) -> tuple[Capture, Capture]:
+    """Captures with fitted people: furniture of the library, and true shapes wrongly placed."""
+    camera = replace(scene.truth.camera, R_cam_world=LEVEL)  # its tilt is not given
+    bodies = fit_bodies(FitInputs(scene.keypoints, camera, open_body())).bodies
     first = first_scene(
         seen_from(picture_of(scene.detections, camera), bodies, run), LayoutConfig(), run
     )
-    numbers: dict[str, Any] = {
-        "stature": float(tall[0]),
-        **overlaps("first", first.scene.objects, scene),
-        **overlaps("imapper", by_kind(scene.imapper, scene.truth.objects), scene),
-    }
-    given = wrongly_placed(scene, camera)
-    numbers |= overlaps("given", given.objects, scene)
-    for name, start, tilt in (("run", first.scene, first.tilt), ("run_given", given, None)):
-        capture = replace(capture_of(scene, start, bodies), tilt=tilt)
-        room = reconstruct(capture, PRESETS[preset], run)
-        numbers |= overlaps(name, room.scene.objects, scene)
-        numbers |= camera_errors(name, room.scene, scene.truth)
-    return numbers
+    library, shapes = (capture_of(scene, start, bodies)
+                       for start in (first.scene, wrongly_placed(scene, camera)))  # fmt: skip
+    return replace(library, tilt=first.tilt), shapes
 
 
 def picture_of(detections: tuple[Detection, ...], camera: Camera) -> Picture:
@@ -276,6 +287,7 @@ def capture_of(scene: I3dbScene, start: Scene, bodies: Bodies) -> Capture:
     return Capture(
         name=scene.name, scene=start, camera_height=None, detections=scene.detections,
         reference=None, reference_people=None, bodies=bodies, people=None, touch=None, warnings=(),
+        keypoints=scene.keypoints,
     )  # fmt: skip
 
 

@@ -105,17 +105,6 @@ def names_of(captures: Sequence[Path]) -> list[str]:
     ]
 
 
-def fingerprint(settings: str, capture: Path) -> str:
-    """Of settings and of what a capture's files are: names, sizes, times of change."""
-    digest = hashlib.sha256(settings.encode())
-    for path in sorted(capture.rglob("*")) if capture.is_dir() else [capture]:
-        if path.is_file():
-            file = path.stat()
-            name = path.relative_to(capture).as_posix()
-            digest.update(f"\n{name} {file.st_size} {file.st_mtime_ns}".encode())
-    return digest.hexdigest()[:16]
-
-
 def earlier(job: BatchJob, retry: bool = False) -> Outcome | None:
     """How the job ended before; None: it is to be done, as are failed ones with `retry`."""
     found, out = read_tree(Path(job.out) / RECORD), Path(job.out)

@@ -1,9 +1,12 @@
 """Files that are whole or not there. Imports nothing heavy: commands answer at once."""
 
+import functools
 import glob
+import hashlib
 import os
 import re
 import shutil
+import sys
 import tempfile
 import time
 import zipfile
@@ -13,6 +16,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from tokenize import TokenError
 
+from mover import __version__
 from mover.core.errors import InputError
 
 BROKEN = (
@@ -115,3 +119,25 @@ def unreadable(path: Path, why: Exception | str, expected: str) -> InputError:
     said = reason(ValueError(why) if isinstance(why, str) else why, path)
     name = path.name or path.resolve().name
     return InputError(f"{name}: cannot be read ({said}), expected {expected}")
+
+
+def fingerprint(settings: str, *paths: Path) -> str:
+    """Of settings and of what files, and all in folders, are: names, sizes, times of change."""
+    digest = hashlib.sha256(settings.encode())
+    for root in paths:
+        for path in sorted(root.rglob("*")) if root.is_dir() else [root]:
+            if path.is_file():
+                file, name = path.stat(), path.relative_to(root).as_posix()
+                digest.update(f"\n{name} {file.st_size} {file.st_mtime_ns}".encode())
+    return digest.hexdigest()[:16]
+
+
+@functools.cache
+def sources(package: str = "mover") -> str:
+    """Digest of the version and sources of `mover`, and of another package that builds on it."""
+    digest = hashlib.sha256(__version__.encode())
+    for name in dict.fromkeys(("mover", package)):
+        for folder in getattr(sys.modules.get(name), "__path__", ()):
+            for path in sorted(Path(folder).rglob("*.py")):
+                digest.update(path.read_bytes())
+    return digest.hexdigest()

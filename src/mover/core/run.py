@@ -1,7 +1,5 @@
 """A folder of finished stages: equal inputs and settings are not computed twice."""
 
-import functools
-import hashlib
 import logging
 import resource
 import sys
@@ -14,10 +12,10 @@ from typing import TypeVar
 
 import torch
 
-from mover import __version__
 from mover.core import records
 from mover.core.devices import CPU, named
 from mover.core.errors import InputError
+from mover.core.files import sources
 from mover.core.observe import Observer, silent
 
 log = logging.getLogger(__name__)
@@ -93,14 +91,3 @@ class Run:
         package = (getattr(fn, "__module__", None) or "").partition(".")[0]
         key = records.fingerprint(inputs, config, sources(package), *where)
         return name, device, self.folder / "stages" / name / key
-
-
-@functools.cache
-def sources(package: str = "mover") -> str:
-    """Digest of the version and sources of `mover`, and of another package that builds on it."""
-    digest = hashlib.sha256(__version__.encode())
-    for name in dict.fromkeys(("mover", package)):
-        for folder in getattr(sys.modules.get(name), "__path__", ()):
-            for path in sorted(Path(folder).rglob("*.py")):
-                digest.update(path.read_bytes())
-    return digest.hexdigest()

@@ -239,6 +239,7 @@ class Capture:
     """Other positions and shapes of the scene's objects, under their ids: further starts."""
     path: CameraPath = STILL  #: where the camera was when it saw the people
     depth: DepthImage | None = None  #: measured depth of the reference picture
+    keypoints: Keypoints | None = None  #: in the frames; read where people have no masks
     focal_spread: float | None = None
     """Standard deviation of the logarithm of the focal length; 0: it was measured. None:
     unknown."""

@@ -1,5 +1,6 @@
 """What `run` does, the main job; `batch`, which runs it on thousands of captures; and `demo`."""
 
+import json
 import os
 import sys
 from collections import Counter
@@ -11,10 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from mover.app.batch import CONFIG, SUMMARY, BatchJob, RayOptions
+from mover.app.batch import CONFIG, PRODUCTS, SUMMARY, BatchJob, RayOptions
 from mover.app.cli import config as flags
 from mover.app.cli import say
 from mover.core.errors import InputError
+from mover.core.files import fingerprint, replacing, sources
 from mover.core.settings import Seconds, int_in
 from mover.io.formats import chosen
 from mover.pipeline.presets import PRESETS, Config
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     from mover.core.run import Run
     from mover.core.types import Capture, Room
 
+FINISHED = "finished"  # in OUT/stages: of what the whole result is
 THREADS = 1  # of torch: its operations here are small, and threads that wait for others cost more
 
 
@@ -56,8 +59,20 @@ def parse_run(arguments: Sequence[str]) -> tuple[RunArgs, Config]:
 
 
 def run(arguments: Sequence[str]) -> None:
-    """`mover run`."""
+    """`mover run`; nothing is read where the result of the same inputs is there already."""
     args, config = parse_run(arguments)
+    said = config, args.source.resolve(), args.format, args.device, args.refine, sources()
+    more = (args.edits, os.environ.get("MOVER_BODY_MODELS"))
+    made = fingerprint(repr(said), args.source, *(Path(path) for path in more if path))
+    mark = args.out / "stages" / FINISHED
+    if mark.is_file():
+        if mark.read_text() == made + _products(args.out):
+            log = json.loads((args.out / "run.json").read_text())
+            for line in (*(f"warning: {text}" for text in log["warnings"]), *log["estimates"]):
+                say(line)
+            say(f"{args.out}: has the result of this capture and these settings already")
+            return
+        mark.unlink()
     read = chosen("--format", args.format, "capture")
     from mover.app.results import Origin
     from mover.core.devices import device_of
@@ -72,7 +87,14 @@ def run(arguments: Sequence[str]) -> None:
         if old not in ("", origin.source):
             say(f"note: {args.out} has the result of {old}, which is replaced")
     reconstruct_into(args.out, capture, config, origin)
+    with replacing(mark) as part:
+        part.write_text(made + _products(args.out))
     say(f"report: {args.out / 'report.html'}")
+
+
+def _products(out: Path) -> str:
+    """What a finished result is."""
+    return fingerprint("", *(out / name for name in (*PRODUCTS, "bodies.npz", "report.html")))
 
 
 def reconstruct_into(
@@ -158,7 +180,7 @@ def batch(arguments: Sequence[str]) -> None:
 def _jobs(args: BatchArgs, config: Config, captures: Sequence[Path]) -> list[BatchJob]:
     """A job for each capture; the settings are handed over in one file for all."""
     from mover import __version__
-    from mover.app.batch import fingerprint, names_of
+    from mover.app.batch import names_of
     from mover.core import records
     from mover.io.files.fields import write_json
 

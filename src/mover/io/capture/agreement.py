@@ -5,13 +5,23 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from operator import attrgetter
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from mover.core.records import rows_of
-from mover.core.types import Bodies, Camera, Capture, Masks, Mesh, People, SceneObject
+from mover.core.types import (
+    Bodies,
+    Camera,
+    Capture,
+    Keypoints,
+    Masks,
+    Mesh,
+    People,
+    SceneObject,
+)
 from mover.furniture.library import SIZES, canonical
 from mover.geometry.boxes import iou2d
 from mover.geometry.camera import NEAR, project, to_camera
@@ -24,6 +34,8 @@ MOST_OBJECTS, MOST_BODIES, MOST_MASKS, POSES = 40, 240, 40, 16
 UPPER, LOWER = ("head", "neck"), "pelvis"
 HEIGHTS = (0.8, 2.3)  # [m], of sitting children and standing adults
 FULL_TURN = 2 * math.pi + 0.01  # [rad], a yaw beyond is hardly in radians
+SEEN, JOINTS = 0.1, 4  # confidence of a joint that is seen, and how many make a person
+SKIN = (0.05, 0.08, 0.05, 0.05)  # by so much of its longer side a body reaches beyond its joints
 
 
 @dataclass(frozen=True)
@@ -56,6 +68,8 @@ SCORES = [field.name for field in fields(Agreement) if field.name != "boxes"]
 def thinned_capture(capture: Capture) -> Capture:
     """Few points, objects and bodies, enough for all outlines."""
     scene, bodies, people = capture.scene, capture.bodies, capture.people
+    if people is None and capture.keypoints is not None:
+        people = around_joints(capture.keypoints, scene.camera)
     if people is not None and bodies is None:  # no time to compare
         few = torch.linspace(0, len(people.frame) - 1, MOST_BODIES).long().unique()
         people = rows_of(people, few)
@@ -66,6 +80,23 @@ def thinned_capture(capture: Capture) -> Capture:
         bodies=None if bodies is None else _few_points(bodies), people=people, hypotheses=(),
         furniture=None,
     )  # fmt: skip
+
+
+def around_joints(joints: Keypoints, camera: Camera) -> People:
+    """People as the rectangles that bodies with these joints fill."""
+    from pycocotools import mask as coco
+
+    seen = joints.confidence > SEEN
+    rows = seen.sum(1) >= JOINTS
+    points, seen = joints.points[rows], seen[rows, :, None]
+    low, high = (points.where(seen, torch.tensor(end)) for end in (math.inf, -math.inf))
+    boxes = torch.cat([low.amin(1), high.amax(1)], -1)
+    side = (boxes[:, 2:] - boxes[:, :2]).amax(1, keepdim=True)
+    boxes = in_image(boxes + side * torch.tensor(SKIN) * torch.tensor([-1, -1, 1, 1]), camera)
+    boxes[:, 2:] -= boxes[:, :2]
+    codes: Any = coco.frPyObjects(boxes.double().numpy(), camera.height, camera.width)
+    masks = Masks(camera.height, camera.width, tuple(code["counts"] for code in codes))
+    return People(masks, joints.frame[rows], joints.person[rows])
 
 
 def outermost(one: SceneObject) -> SceneObject:

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mover.core.errors import InputError
-from mover.core.types import Camera, Capture
+from mover.core.types import Camera, Capture, SceneObject
 from mover.furniture.library import canonical
 from mover.geometry.boxes import iou2d
 from mover.geometry.camera import to_camera
@@ -68,35 +68,45 @@ class Findings:
     faults: tuple[Fault, ...]
     unexplained: tuple[str, ...]
     """What does not fit, without a hypothesis that explains it."""
+    by_joints: bool
+    """Whether keypoints showed the people, as they have no masks."""
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """A sentence each."""
-        return (*(f"{fault.name}; {fault.cure}" for fault in self.faults), *self.unexplained)
+        said = (*(f"{fault.name}; {fault.cure}" for fault in self.faults), *self.unexplained)
+        if not self.by_joints:
+            return said
+        joints = (text.replace("people.json", "keypoints").replace("masks", "keypoints")
+                  if text.startswith(("bodies", "people")) else text for text in said)  # fmt: skip
+        return tuple(joints)
 
     @property
     def summary(self) -> tuple[str, ...]:
         """How far outlines and masks share the picture, as they are given."""
+        seen = f"bodies and their {'keypoints' if self.by_joints else 'masks'}"
         known = {"objects and their annotations": self.agreement.objects,
-                 "bodies and their masks": self.agreement.people}  # fmt: skip
+                 seen: self.agreement.people}  # fmt: skip
         lines = [f"in the picture, {name} share {100 * mean(score):.0f} % of their boxes"
                  for name, score in known.items() if not bool(score.isnan().all())]  # fmt: skip
         if len(self.agreement.heights) and bool(self.agreement.people.isnan().all()):
-            lines.append("bodies could not be held against the picture, as there are no masks of"
-                         " people: their times, their lens, their left and right")  # fmt: skip
+            lines.append("bodies could not be held against the picture, as there are no masks or"
+                         " keypoints: their times, their lens, their left and right")  # fmt: skip
         return tuple(lines)
 
 
 def check_against_picture(capture: Capture) -> Findings:
     """Hold scene, bodies and masks of a capture against each other: all lie in one picture."""
-    thin = agree.thinned_capture(capture)
+    thin, by_joints = agree.thinned_capture(capture), capture.people is None
+    if by_joints:
+        thin = mends.same_tracks(thin)
     own = agree.agreement(thin)
     faults, mended, found = _faults(thin, own)
     if len(own.objects) and mean(found.objects) < POOR:  # no cure leads to where objects are seen
         faults = [one for one in faults if not one.name.startswith(("scene.json", "camera.json"))]
         mended = functools.reduce(lambda x, one: one.mend(x), faults, thin)
         found = agree.agreement(mended)
-    return Findings(own, tuple(faults), tuple(_unexplained(mended, found)))
+    return Findings(own, tuple(faults), tuple(_unexplained(mended, found)), by_joints)
 
 
 def _faults(thin: Capture, found: agree.Agreement) -> tuple[list[Fault], Capture, agree.Agreement]:
@@ -243,7 +253,7 @@ def _worlds() -> Iterator[Fault]:
 
 
 def _alone(capture: Capture, found: agree.Agreement) -> Iterator[Fault]:
-    """One object that is nearly nowhere to be seen, by its mesh or size, and one inverted mask."""
+    """Objects that are nearly nowhere to be seen, by mesh or size, and one inverted mask."""
     known, boxes = agree.annotated(capture)
     names = {one.annotation: one.id for one in known}
     for d in capture.detections if len(capture.detections) > 1 else ():
@@ -251,14 +261,21 @@ def _alone(capture: Capture, found: agree.Agreement) -> Iterator[Fault]:
             name = f"objects.json: the mask of {names.get(d.id, f'annotation {d.id}')} is inverted"
             mend = partial(mends.inverted_objects, only=d.id)
             yield Fault(name, "invert it", mend, ALONE / len(capture.detections))
-    if len(known) < 2 or len(known) != len(found.objects) or float(found.objects.min()) > 1 - ALONE:
-        return
-    at, camera = int(found.objects.argmin()), capture.scene.camera
-    one, margin = known[at], ALONE / len(known)
+    if 1 < len(known) == len(found.objects):
+        for at in found.objects.argsort(stable=True)[:MOST_FAULTS].tolist():
+            if float(found.objects[at]) <= 1 - ALONE:
+                margin = ALONE / len(known)
+                yield from _of_one(known[at], boxes[at], capture.scene.camera, margin)
+
+
+def _of_one(
+    one: SceneObject, box: Float[Tensor, "4"], camera: Camera, margin: float
+) -> Iterator[Fault]:
+    """What its mesh or size may be instead."""
     name, (rows, *_) = next(iter(WORLDS.items()))
     factors = SCALES.square().tolist()
     ours = agree.outlines([mends.scaled(k, 1)(one) for k in factors], camera)
-    k = factors[int(iou2d(agree.in_image(ours, camera), boxes[at].expand_as(ours)).argmax())]
+    k = factors[int(iou2d(agree.in_image(ours, camera), box.expand_as(ours)).argmax())]
     size = f"{1 / k:.2g} times too large" if k < 1 else f"{k:.2g} times too small"
     twice = mends.baked(one.mesh.verts, one)
     changes = [

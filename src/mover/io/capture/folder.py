@@ -51,6 +51,8 @@ from mover.io.files.cameras import tilt_fields
 from mover.io.files.fields import At, Warn, listed, read_json, read_npz, write_json, write_npz
 from mover.io.files.meshes import read_mesh
 from mover.io.files.schema import checked
+from mover.io.people.found import Known
+from mover.io.people.keypoints import read_keypoints, read_openpose, write_keypoints
 
 SLOW, FAST = 2.0, 250.0  # frames a second, of usual videos
 SAME_RATE = 0.01  # relative difference of two rates that are one
@@ -209,7 +211,19 @@ def read_capture(folder: Path) -> Capture:
     if named is None and (folder / REFERENCE).is_file():
         named = At(REFERENCE, "objects.json", "images[0].file_name")
     load = None if named is None else partial(images.read_image, named, folder)
-    return build_capture(replace(parts, load_image=load))
+    capture = build_capture(replace(parts, load_image=load))
+    if capture.people is not None or capture.bodies is None:
+        return capture
+    one, many = folder / "keypoints.npz", folder / "keypoints"
+    try:
+        if one.is_file():
+            return replace(capture, keypoints=read_keypoints(one))
+        if many.is_dir():
+            return replace(capture, keypoints=read_openpose(many, Known()))
+    except InputError as error:  # the method does without
+        note = f"{error}; bodies are not held against it"
+        return replace(capture, warnings=(*capture.warnings, note))
+    return capture
 
 
 def folder_parts(folder: Path, hints: Hints | None = None) -> Parts:
@@ -311,6 +325,8 @@ def write_capture(capture: Capture, folder: Path) -> None:
         images.write_image(capture.reference, folder / "reference.png")
     if capture.bodies is not None:
         write_bodies(capture.bodies, folder / "bodies.npz")
+    if capture.keypoints is not None:
+        write_keypoints(capture.keypoints, folder / "keypoints.npz")
     if capture.touch is not None:
         touch = capture.touch.detach().cpu().numpy()
         write_npz({"probability": touch}, folder / "contacts.npz")
@@ -326,8 +342,7 @@ def write_capture(capture: Capture, folder: Path) -> None:
     others = {h.id for h in capture.hypotheses}
     groups = {one.id: [one, *(h for h in capture.hypotheses if h.id == one.id)]
               for one in capture.scene.objects if one.id in others}  # fmt: skip
-    if groups:
-        write_hypotheses(folder, groups)
+    write_hypotheses(folder, groups)
 
 
 def write_trees(

@@ -275,8 +275,11 @@ def hypotheses_of(at: At, load: LoadMesh, scene: Scene, warn: Warn) -> tuple[Sce
 def write_hypotheses(folder: Path, groups: Mapping[str, Sequence[SceneObject]]) -> None:
     """Write hypotheses.json beside a scene.json that is written already, and their meshes.
 
-    The groups hold those of each object, best first; the first is the one in the scene.
+    The groups hold those of each object, best first; the first is the one in the scene. Without
+    any group there is no such file.
     """
+    if not groups:
+        return
     scene = json.loads((folder / "scene.json").read_text())
     meshes = {row["id"]: row["mesh"] for row in scene["objects"]}
     rows: dict[str, list[dict[str, Any]]] = {}
