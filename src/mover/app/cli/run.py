@@ -66,7 +66,7 @@ def run(arguments: Sequence[str]) -> None:
     made = fingerprint(repr(said), args.source, *(Path(path) for path in more if path))
     mark = args.out / "stages" / FINISHED
     if mark.is_file():
-        if mark.read_text() == made + _products(args.out):
+        if mark.read_bytes() == (made + _products(args.out)).encode():
             log = json.loads((args.out / "run.json").read_text())
             for line in (*(f"warning: {text}" for text in log["warnings"]), *log["estimates"]):
                 say(line)

@@ -90,7 +90,7 @@ class Findings:
         lines = [f"in the picture, {name} share {100 * mean(score):.0f} % of their boxes"
                  for name, score in known.items() if not bool(score.isnan().all())]  # fmt: skip
         if len(self.agreement.heights) and bool(self.agreement.people.isnan().all()):
-            lines.append("bodies could not be held against the picture, as there are no masks or"
+            lines.append("bodies could not be held against the picture, as they have no masks or"
                          " keypoints: their times, their lens, their left and right")  # fmt: skip
         return tuple(lines)
 
