@@ -25,7 +25,7 @@ from mover.app.batch import (
     run_job,
 )
 from mover.core.errors import InputError
-from mover.core.files import fingerprint
+from mover.core.files import fingerprint_of_files
 
 REFUSED = "mover run: camera.json: field 'w' has 0, expected a number above 0"
 FAKE = """
@@ -71,7 +71,7 @@ def jobs_of(
     for capture in captures_in(folder / "captures"):
         place = str(folder / out / capture.name)
         command = (sys.executable, "-S", "-E", str(folder / "fake.py"), str(capture), place)
-        mark = fingerprint(settings, capture)
+        mark = fingerprint_of_files(settings, capture)
         jobs.append(BatchJob(capture.name, str(capture), place, command, mark, limit))
     return jobs
 

@@ -121,7 +121,7 @@ def unreadable(path: Path, why: Exception | str, expected: str) -> InputError:
     return InputError(f"{name}: cannot be read ({said}), expected {expected}")
 
 
-def fingerprint(settings: str, *paths: Path) -> str:
+def fingerprint_of_files(settings: str, *paths: Path) -> str:
     """Of settings and of what files, and all in folders, are: names, sizes, times of change."""
     digest = hashlib.sha256(settings.encode())
     for root in paths:

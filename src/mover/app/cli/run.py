@@ -16,7 +16,7 @@ from mover.app.batch import CONFIG, PRODUCTS, SUMMARY, BatchJob, RayOptions
 from mover.app.cli import config as flags
 from mover.app.cli import say
 from mover.core.errors import InputError
-from mover.core.files import fingerprint, replacing, sources
+from mover.core.files import fingerprint_of_files, replacing, sources
 from mover.core.settings import Seconds, int_in
 from mover.io.formats import chosen
 from mover.pipeline.presets import PRESETS, Config
@@ -63,7 +63,7 @@ def run(arguments: Sequence[str]) -> None:
     args, config = parse_run(arguments)
     said = config, args.source.resolve(), args.format, args.device, args.refine, sources()
     more = (args.edits, os.environ.get("MOVER_BODY_MODELS"))
-    made = fingerprint(repr(said), args.source, *(Path(path) for path in more if path))
+    made = fingerprint_of_files(repr(said), args.source, *(Path(path) for path in more if path))
     mark = args.out / "stages" / FINISHED
     if mark.is_file():
         if mark.read_bytes() == (made + _products(args.out)).encode():
@@ -94,7 +94,8 @@ def run(arguments: Sequence[str]) -> None:
 
 def _products(out: Path) -> str:
     """What a finished result is."""
-    return fingerprint("", *(out / name for name in (*PRODUCTS, "bodies.npz", "report.html")))
+    names = (*PRODUCTS, "bodies.npz", "report.html")
+    return fingerprint_of_files("", *(out / name for name in names))
 
 
 def reconstruct_into(
@@ -193,7 +194,7 @@ def _jobs(args: BatchArgs, config: Config, captures: Sequence[Path]) -> list[Bat
     jobs: list[BatchJob] = []
     for name, capture in zip(names_of(captures), captures, strict=True):
         words = (sys.executable, "-m", "mover", "run", str(capture), "--out", str(out / name))
-        mark = fingerprint(settings, capture)
+        mark = fingerprint_of_files(settings, capture)
         paths = (str(capture), str(out / name))
         jobs.append(BatchJob(name, *paths, (*words, *more), mark, args.limit, args.threads))
     return jobs

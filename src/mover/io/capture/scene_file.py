@@ -279,6 +279,7 @@ def write_hypotheses(folder: Path, groups: Mapping[str, Sequence[SceneObject]]) 
     any group there is no such file.
     """
     if not groups:
+        (folder / HYPOTHESES).unlink(missing_ok=True)
         return
     scene = json.loads((folder / "scene.json").read_text())
     meshes = {row["id"]: row["mesh"] for row in scene["objects"]}
