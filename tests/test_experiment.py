@@ -39,11 +39,12 @@ from mover_bench.experiment.variants import (
     VARIANTS,
     Cut,
     Variant,
+    at_most,
     frames_of,
     names_in,
     withheld,
 )
-from mover_bench.rooms.config import CHANGES, SETS, changed, parse_seeds
+from mover_bench.rooms.config import CHANGES, SETS, changed, parse_seeds, set_named
 
 FEW = EvaluateConfig(samples=200, bodies=2)
 KNOWN = dict(VARIANTS)
@@ -149,6 +150,14 @@ def test_seeds_are_numbers_and_ranges_in_order_and_anything_else_is_refused() ->
     for text in ("", "a", "3-1", "1-", "-2", "1..3", "1,,2", "²"):
         with pytest.raises(InputError, match="--seeds"):
             parse_seeds(text)
+
+
+def test_fewer_steps_are_another_result_and_bound_every_descent() -> None:
+    rooms, paper = set_named("rooms"), VARIANTS["paper"]
+    few = at_most(paper, 5)
+    assert (few.config.layout.method.steps, few.config.place.method.steps) == (5, 5)
+    assert at_most(paper, 0) == paper == at_most(paper, 10**6)
+    assert job.key_of(rooms, 0, few) != job.key_of(rooms, 0, paper)
 
 
 @pytest.mark.slow

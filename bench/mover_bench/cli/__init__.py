@@ -34,6 +34,8 @@ class ExperimentArgs:
     """For the set i3db: the folder i3DB of amonszpart/iMapper. Its scenes are reconstructed with
     the first variant, from library furniture and from the true shapes. For clips: folders with
     video.mp4 and furniture.json (outlines), of which `mover video` makes rooms."""
+    steps: Annotated[int, int_in(0, 1_000_000)] = 0
+    """At most so many steps of each descent; 0: as many as the preset has."""
 
 
 Table = Literal["prox", "prox-quantitative", "pigraphs"]

@@ -1,6 +1,6 @@
 """Run an experiment: known rooms beside each other, each with all variants, measured by the truth.
 
-A process a room (`python -m mover_bench.experiment.job SET SEED OUT VARIANT ...`) with one
+A process a room (`python -m mover_bench.experiment.job SET SEED STEPS OUT VARIANT ...`) with one
 thread. Variants share their finished stages; what is finished is a file OUT/SET/SEED/VARIANT.json
 and is not done again; a variant that fails leaves its traceback there.
 """
@@ -47,7 +47,7 @@ from mover.stages.objects.prepare_objects import find_regions
 from mover.stages.people.refine_bodies import refine_bodies
 from mover_bench.cli import ExperimentArgs
 from mover_bench.experiment.tables import LOG, path_of, write_tables
-from mover_bench.experiment.variants import VARIANTS, Variant, names_in, withheld
+from mover_bench.experiment.variants import VARIANTS, Variant, at_most, names_in, withheld
 from mover_bench.rooms.config import RoomSet, changed, parse_seeds, set_named
 from mover_bench.rooms.known import KnownRoom, make_room
 from mover_bench.rooms.moving import filmed, make_moved_room
@@ -253,10 +253,10 @@ def key_of(rooms: RoomSet, seed: int, variant: Variant) -> str:
     return records.fingerprint(*made, seed, variant, sources("mover_bench"))
 
 
-def is_finished(out: Path, rooms: str, seed: int, name: str) -> bool:
+def is_finished(out: Path, rooms: str, seed: int, steps: int, name: str) -> bool:
     """Whether numbers of this version are there."""
-    found = read_tree(path_of(out, rooms, seed, name))
-    return "full" in found and found["key"] == key_of(set_named(rooms), seed, VARIANTS[name])
+    found, variant = read_tree(path_of(out, rooms, seed, name)), at_most(VARIANTS[name], steps)
+    return "full" in found and found["key"] == key_of(set_named(rooms), seed, variant)
 
 
 def measured(trial: Trial, judge: Judge, variant: Variant, run: Run) -> dict[str, Any]:
@@ -274,18 +274,19 @@ def measured(trial: Trial, judge: Judge, variant: Variant, run: Run) -> dict[str
     return judge.room(room) | {"seconds": seconds}
 
 
-def do_room(out: Path, rooms: str, seed: int, names: Sequence[str]) -> None:
+def do_room(out: Path, rooms: str, seed: int, steps: int, names: Sequence[str]) -> None:
     """Reconstruct and measure the room of a seed under each variant, and write their numbers."""
+    variants = {name: at_most(VARIANTS[name], steps) for name in names}
     chosen = set_named(rooms)
     folder = out / rooms / str(seed)
     room = true_room(seed, chosen)
-    for change in dict.fromkeys(VARIANTS[name].change for name in names):
+    for change in dict.fromkeys(variant.change for variant in variants.values()):
         trial = with_noise(room, seed, changed(chosen, change))
         judge = Judge(trial)
-        for name in (name for name in names if VARIANTS[name].change == change):
-            about = {"key": key_of(chosen, seed, VARIANTS[name]), "version": __version__}
+        for name, variant in ((n, v) for n, v in variants.items() if v.change == change):
+            about = {"key": key_of(chosen, seed, variant), "version": __version__}
             try:
-                numbers = measured(trial, judge, VARIANTS[name], Run(folder))
+                numbers = measured(trial, judge, variant, Run(folder))
             except Exception:  # other variants go on; the summary names it
                 numbers = {"failed": traceback.format_exc()}
             with replacing(path_of(out, rooms, seed, name)) as part:
@@ -303,13 +304,10 @@ def run_experiment(args: ExperimentArgs, observe: Observer = silent, pool: Pool 
         raise InputError("pandas is not installed; pip install -e '.[bench]' in mover's folder")
     seeds, names = parse_seeds(args.seeds), names_in(args.variants)
     set_named(args.set)
-    open_seeds = [
-        seed for seed in seeds if not all(is_finished(args.out, args.set, seed, n) for n in names)
-    ]
-    jobs = [
-        ((args.set, str(seed), str(args.out), *names), args.out / args.set / str(seed) / LOG)
-        for seed in open_seeds
-    ]
+    where = args.out, args.set
+    open_seeds = [s for s in seeds if not all(is_finished(*where, s, args.steps, n) for n in names)]
+    fixed = str(args.steps), str(args.out), *names
+    jobs = [((args.set, str(s), *fixed), args.out / args.set / str(s) / LOG) for s in open_seeds]
     ended = pool("mover_bench.experiment.job", jobs, args.workers)
     for done, index in enumerate(ended, len(seeds) - len(jobs)):
         observe(Step(f"{args.set} {open_seeds[index]}", done, len(seeds)))
@@ -318,9 +316,9 @@ def run_experiment(args: ExperimentArgs, observe: Observer = silent, pool: Pool 
 
 def main(arguments: Sequence[str]) -> None:
     """Do what is named on the command line."""
-    rooms, seed, out, *names = arguments
+    rooms, seed, steps, out, *names = arguments
     torch.set_num_threads(1)
-    where = Path(out), rooms, int(seed)
+    where = Path(out), rooms, int(seed), int(steps)
     do_room(*where, [name for name in names if not is_finished(*where, name)])
 
 

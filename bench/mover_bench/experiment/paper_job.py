@@ -44,6 +44,7 @@ from mover_bench.experiment.variants import (
     TERMS,
     Cut,
     Variant,
+    at_most,
     with_terms,
     withheld,
 )
@@ -87,17 +88,6 @@ def variants(preset: str) -> dict[str, Variant]:
         **{name: Variant(config, cut=cut) for name, cut in cuts.items()},
         **{f"noise-{k}-{x:g}": Variant(config, change=f"{k}={x:g}") for k, x in noises},
     }
-
-
-def at_most(variant: Variant, steps: int) -> Variant:
-    """The same with at most so many steps of each descent; 0: as it is."""
-    config = variant.config
-    stages = {"layout": config.layout, "place": config.place}
-    fewer = {
-        name: replace(one, method=replace(one.method, steps=min(one.method.steps, steps)))
-        for name, one in stages.items()
-    }
-    return replace(variant, config=replace(config, **fewer)) if steps else variant
 
 
 ABLATION_ROWS = (

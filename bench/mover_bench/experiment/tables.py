@@ -156,7 +156,8 @@ def page_of(args: ExperimentArgs, names: Sequence[str], found: Finished) -> str:
     lines = [
         f"# Known rooms: {args.set}",
         f"    mover experiment --set {args.set} --seeds {args.seeds} --variants "
-        + " ".join(args.variants),
+        + " ".join(args.variants)
+        + (f" --steps {args.steps}" if args.steps else ""),
         f"mover {versions}, torch {torch.__version__}, {machine}, one thread a room.",
         set_named(args.set).about,
         "Noise: "

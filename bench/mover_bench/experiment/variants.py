@@ -147,6 +147,17 @@ def names_in(asked: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(n for name in asked for n in LISTS.get(name, (name,))))
 
 
+def at_most(variant: Variant, steps: int) -> Variant:
+    """The same with at most so many steps of each descent; 0: as it is."""
+    config = variant.config
+    stages = {"layout": config.layout, "place": config.place}
+    fewer = {
+        name: replace(one, method=replace(one.method, steps=min(one.method.steps, steps)))
+        for name, one in stages.items()
+    }
+    return replace(variant, config=replace(config, **fewer)) if steps else variant
+
+
 def withheld(capture: Capture, given: Given, cut: Cut | None) -> Capture:
     """The capture as a variant gets it: a part of the video, no contacts, no people."""
     if capture.bodies is None:
