@@ -9,6 +9,7 @@ import pytest
 import torch
 from little_room import room, walkers
 
+from mover.core.records import rows_of
 from mover.core.types import Bodies, Capture, Detection, Keypoints, Masks, People, Tilt
 from mover.geometry.camera import pitch_roll, tilted, to_camera
 from mover.geometry.rle import encode, mask_boxes
@@ -149,6 +150,24 @@ def test_without_masks_keypoints_show_the_faults_of_bodies(right, name):
     said = [text for text in findings.warnings if words in text]
     assert said, findings.warnings
     assert "mask" not in said[0]
+
+
+def test_a_person_whom_no_keypoints_show_is_named(right):
+    joints = with_joints(right).keypoints
+    alone = rows_of(joints, joints.person == right.people.person[0])
+    lone = int(right.bodies.person.unique()[right.bodies.person.unique() != alone.person[0]])
+    (said,) = check_against_picture(replace(right, people=None, keypoints=alone)).warnings
+    assert said == f"bodies.npz: no keypoints show person {lone}, whom the bodies have"
+
+
+@pytest.mark.parametrize("see", [lambda one: one, with_joints])
+def test_one_person_of_several_who_is_elsewhere_is_named(right, see):
+    bodies = right.bodies
+    lone = int(bodies.person.max())
+    away = torch.tensor([0.4, -0.3, 2.0]) * (bodies.person == lone)[:, None, None]
+    turned = bodies.verts + away * bodies.verts[:1].abs().amax((0, 1))
+    found = check_against_picture(replace(see(right), bodies=replace(bodies, verts=turned)))
+    assert any(f"person {lone} miss their" in text for text in found.warnings), found.warnings
 
 
 def test_keypoints_of_a_folder_are_read_where_there_are_no_masks(right, tmp_path):

@@ -12,7 +12,7 @@ from tiny_capture import compressed, runs
 
 from mover.core.errors import InputError
 from mover.core.types import Masks
-from mover.geometry.rle import area, decode, encode, run_lengths, tight_box
+from mover.geometry.rle import area, decode, encode, resampled, run_lengths, tight_box
 from mover.io.files.fields import At
 from mover.io.masks.coco import from_coco
 
@@ -42,6 +42,19 @@ def test_both_codes_and_the_encoder_give_the_mask_back(mask):
 @given(st.lists(st.integers(0, 10**7), min_size=1, max_size=40))
 def test_a_compressed_code_holds_its_runs(counts):
     assert run_lengths(compressed(counts).encode()).tolist() == counts
+
+
+@given(MASKS, st.integers(1, 20), st.integers(1, 20))
+def test_a_resampled_code_is_that_of_the_pixels_that_are_picked(mask, height, width):
+    rows, columns = (
+        (np.arange(n) + 0.5) * m // n for m, n in zip(mask.shape, (height, width), strict=True)
+    )
+    rows, columns = rows.astype(np.int64), columns.astype(np.int64)
+    picked = mask[rows][:, columns]
+    split = [part for run in runs(mask) for part in (run // 2, 0, run - run // 2)]
+    for code in (encode(torch.from_numpy(mask)), compressed(split).encode()):
+        found = resampled(Masks(*mask.shape, (code,)), 0, rows, columns)
+        assert found == (encode(torch.from_numpy(picked)) if picked.any() else None)
 
 
 @given(st.binary(max_size=12) | st.text(max_size=12))

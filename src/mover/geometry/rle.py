@@ -49,6 +49,36 @@ def run_lengths(counts: bytes) -> NDArray[np.int64]:
     return values
 
 
+def resampled(
+    masks: Masks, index: int, rows: NDArray[np.int64], columns: NDArray[np.int64]
+) -> bytes | None:
+    """The code of one of the masks at these rows and columns, both ascending; None: empty there.
+
+    Each run of a column stays one in each column that shows it; runs that then touch are joined.
+    """
+    from pycocotools import mask as coco
+
+    high, ends = masks.height, np.cumsum(run_lengths(masks.counts[index]))
+    starts, stops = ends[:-1:2], ends[1::2]
+    spans = np.where(stops > starts, (stops - 1) // high - starts // high + 1, 0)
+    run = np.repeat(np.arange(len(spans)), spans)
+    column = starts[run] // high + np.arange(len(run)) - (np.cumsum(spans) - spans)[run]
+    top = np.searchsorted(rows, (starts[run] - column * high).clip(0))
+    bottom = np.searchsorted(rows, (stops[run] - column * high).clip(max=high))
+    first = np.searchsorted(columns, column)
+    copies = np.where(bottom > top, np.searchsorted(columns, column, "right") - first, 0)
+    piece = np.repeat(np.arange(len(copies)), copies)
+    shown = first[piece] + np.arange(len(piece)) - (np.cumsum(copies) - copies)[piece]
+    starts, stops = (np.sort(shown * len(rows) + end[piece]) for end in (top, bottom))
+    if not len(starts):
+        return None
+    new = np.append(True, starts[1:] > stops[:-1])
+    borders = np.stack([starts[new], stops[np.append(new[1:], True)]], 1).reshape(-1)
+    runs = np.diff(np.concatenate([[0], borders, [len(rows) * len(columns)]])).tolist()
+    tree: Any = {"size": [len(rows), len(columns)], "counts": runs[:-1] if not runs[-1] else runs}
+    return coco.frPyObjects(tree, len(rows), len(columns))["counts"]  # pyright: ignore
+
+
 def encode(mask: Bool[Tensor, "h w"]) -> bytes:
     """The compressed run-length code of a mask."""
     from pycocotools import mask as coco

@@ -166,7 +166,8 @@ def _gain(own: agree.Agreement, other: agree.Agreement) -> float:
 
 def _unexplained(thin: Capture, found: agree.Agreement) -> Iterator[str]:
     """What fits nothing, and that nothing could be compared."""
-    rows, both = int((~found.people.isnan()).sum()), "(mean overlap in the picture {:.2f})"
+    seen, both = ~found.people.isnan(), "(mean overlap in the picture {:.2f})"
+    rows = int(seen.sum())
     if not len(found.objects) and not rows:
         yield "nothing could be held against the picture: no object or body has a box or a mask"
     known, _ = agree.annotated(thin)
@@ -180,6 +181,15 @@ def _unexplained(thin: Capture, found: agree.Agreement) -> Iterator[str]:
     if rows >= FEWEST and mean(found.people) < POOR:
         missed = f"bodies.npz: the bodies miss their masks {both}".format
         yield f"{missed(mean(found.people))}; are bodies, masks and camera of one video?"
+        return
+    person = torch.zeros(0) if thin.bodies is None else thin.bodies.person
+    for one in person.unique().tolist() if rows else ():
+        own = seen & (person == one)
+        if not own.any() and thin.keypoints is not None:  # without a mask: said by the reader
+            yield f"bodies.npz: no masks show person {one}, whom the bodies have"
+        elif int(own.sum()) >= FEWEST and mean(found.people[own]) < POOR:
+            missed = f"bodies.npz: the bodies of person {one} miss their masks {both}".format
+            yield f"{missed(mean(found.people[own]))}; are they of this video?"
 
 
 WORLDS = {
@@ -325,8 +335,8 @@ def _times(capture: Capture, found: agree.Agreement) -> Iterator[Fault]:
         mine = torch.ones_like(rows[0]).bool() if who is None else bodies.person == who
         both = (rows >= 0).where(mine, rows[0] >= 0)
         shared, total = both.sum(1), (both * fits.where(mine, fits[0])).sum(1)
-        score = total / shared.clamp_min(1)
-        score[shared < max(FEWEST, int(shared.max()) / 2)] = -1
+        score, own = total / shared.clamp_min(1), (both & mine).sum(1)
+        score[own < max(FEWEST, int(own.max()) / 2)] = -1
         if float(score.max()) < FITTED_TIME:
             continue
         score = score * (shared / rows.shape[1]).sqrt().sqrt()  # few rows fit by chance

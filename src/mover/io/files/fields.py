@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NoReturn
 
+import msgspec
 import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
@@ -210,9 +211,9 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def write_json(value: object, path: Path) -> None:
     """Write JSON in one step, always the same bytes for the same value."""
-    body = json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    body = json.dumps(value, allow_nan=False, ensure_ascii=False)
     with replacing(path) as part:
-        part.write_text(body, encoding="utf-8")
+        part.write_text(msgspec.json.format(body, indent=1) + "\n", encoding="utf-8")
 
 
 def plain(value: Any) -> Any:  # noqa: ANN401

@@ -14,7 +14,7 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from mover.io.files.fields import FASTEST, LARGEST, LAST_ID, LAST_INDEX, MISSING, SLOWEST, At
+from mover.io.files.fields import FASTEST, LARGEST, LAST_ID, LAST_INDEX, SLOWEST, At
 
 Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST, description="a finite number")]
 Positive = Annotated[float, Meta(ge=1 / LARGEST, le=LARGEST, description="a number above 0")]
@@ -52,8 +52,8 @@ def checked(at: At, kind: Any) -> Any:
     Raises:
         InputError: If a field is missing or wrong: file, field, found, expected.
     """
-    value = at.value.item() if isinstance(at.value, np.generic) else at.value
-    at, origin, args = at.holding(value), get_origin(kind), get_args(kind)
+    at = at.holding(at.value.item()) if isinstance(at.value, np.generic) else at
+    value, (origin, args) = at.value, _form(kind)
     if origin in (Union, types.UnionType):
         if value is None and types.NoneType in args:
             return None
@@ -72,10 +72,10 @@ def checked(at: At, kind: Any) -> Any:
     if origin is dict:
         return {key: checked(at.get(key), args[1]) for key in at.mapping()}
     if isinstance(kind, type) and issubclass(kind, Struct):
-        given = [(f, at.get(f.encode_name)) for f in _fields(kind)]
-        given.sort(key=lambda pair: pair[1].value is MISSING)  # what is wrong before what lacks
-        return kind(**{f.name: checked(one, f.type) for f, one in given
-                       if f.required or one.value is not MISSING})  # fmt: skip
+        there = at.mapping()
+        given = [f for f in _fields(kind) if f.required or f.encode_name in there]
+        given.sort(key=lambda f: f.encode_name not in there)  # what is wrong before what lacks
+        return kind(**{f.name: checked(at.get(f.encode_name), f.type) for f in given})
     return PLAIN[kind](at) if kind in PLAIN else value
 
 
@@ -92,6 +92,7 @@ PLAIN: Mapping[Any, Callable[[At], Any]] = {
 
 
 _fields = functools.cache(msgspec.structs.fields)
+_form = functools.cache(lambda kind: (get_origin(kind), get_args(kind)))
 
 
 def _tagged(at: At, kinds: list[type[Struct]]) -> type[Struct]:

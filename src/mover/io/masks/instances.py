@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from mover.core.errors import InputError
 from mover.core.types import Masks
 from mover.furniture.library import plain_name, unknown_names
-from mover.geometry.rle import area, decode, encode, mask_boxes
+from mover.geometry.rle import area, encode, mask_boxes, resampled
 from mover.io.capture.parts import UNKNOWN
 from mover.io.files.fields import LAST_INDEX, At, listed, read_json
 from mover.io.files.schema import Side, Text, checked
@@ -90,7 +90,7 @@ class Instances:
             if box is not None:
                 box = tuple(v * (width / w, height / h)[i % 2] for i, v in enumerate(box))
             if mask is not None:
-                mask = code_of(decode(Masks(h, w, (mask,)), 0).numpy()[rows][:, columns])
+                mask = resampled(Masks(h, w, (mask,)), 0, rows, columns)
             items.append(dataclasses.replace(item, box=box, mask=mask))
         said = f"masks of {w} x {h} pixels are stretched to the image of {width} x {height}"
         return dataclasses.replace(self, items=tuple(items), size=size, notes=(*self.notes, said))
