@@ -42,17 +42,23 @@ class Segment:
 
 @record
 class SeatStretch:
-    """How the middle of a mesh is raised to where people sit; its bottom and its top stay."""
+    """How the seat of a mesh is raised to where people sit; its bottom and its top stay.
 
-    bottom: Float[Tensor, "*items"]  #: lowest and highest y, in the mesh's coordinates
+    What lies below the seat and what lies above it are each stretched evenly.
+    """
+
+    bottom: Float[Tensor, "*items"]  #: lowest y, the seat's and the highest, as the mesh was [m]
+    seat: Float[Tensor, "*items"]
     top: Float[Tensor, "*items"]
-    rise: Float[Tensor, "*items"]  #: points at the share t of the height go up by 2 t (1 - t) of it
+    rise: Float[Tensor, "*items"]  #: how far the seat goes up [m]
 
     def of(self, points: Float[Tensor, "*items points 3"]) -> Float[Tensor, "*items points 3"]:
         """Points of the mesh, raised."""
-        bottom, height = self.bottom.unsqueeze(-1), (self.top - self.bottom).unsqueeze(-1)
-        share = ((points[..., 1] - bottom) / height.clamp_min(1e-9)).clamp(0, 1)
-        y = points[..., 1] + 2 * share * (1 - share) * self.rise.unsqueeze(-1)
+        y = points[..., 1]
+        ends = (self.bottom, self.top)
+        shares = [((y - end.unsqueeze(-1)) / (self.seat - end).unsqueeze(-1)) for end in ends]
+        share = torch.minimum(*shares).nan_to_num(0.0).clamp(0, 1)
+        y = y + share * self.rise.unsqueeze(-1)
         return torch.stack([points[..., 0], y, points[..., 2]], -1)
 
 

@@ -156,9 +156,10 @@ def _with_raised_seats(
     if known is None:
         return pieces
     unit, low = prepared.scale[:, 1], prepared.center[:, 1]
-    top, rise, out = low + known.top / unit, known.rise / unit, list(pieces)
+    seat, top, rise = low + known.seat / unit, low + known.top / unit, known.rise / unit
+    out = list(pieces)
     for i in known.rise.nonzero()[:, 0].tolist():
-        stretch, mesh = SeatStretch(low[i], top[i], rise[i]), pieces[i].mesh
+        stretch, mesh = SeatStretch(low[i], seat[i], top[i], rise[i]), pieces[i].mesh
         mesh = dataclasses.replace(mesh, verts=stretch.of(mesh.verts))
         out[i] = dataclasses.replace(pieces[i], mesh=mesh, stretch=stretch)
     return tuple(out)

@@ -3,8 +3,8 @@ r"""Seats as high in their meshes as people sit and lie on them (not in the pape
 The image gives the size of an object, from its feet to the top of its back, but not how high its
 seat is in between: that is inside the outline, and a mesh of another design has it elsewhere (7 cm
 off, root mean square, in rooms where no mesh is the true one). Seated people give it to 2.5 cm: the
-lowest of the skin that carries them is the seat. So the middle of a mesh whose shape does not fit
-is raised or lowered until its seat is there; feet and back stay where they are.
+lowest of the skin that carries them is the seat. So the seat of a mesh whose shape does not fit is
+raised or lowered until it is there; feet and back stay where they are.
 """
 
 from dataclasses import replace
@@ -27,7 +27,7 @@ SHAPE = 0.07  # [m], usual error of the height of a seat in a mesh of another de
 LOWEST = 0.15  # share of the supported body points that lie below the top of the seat
 NEAR = 20  # points of a seat that are nearest to a body
 BETWEEN = (0.15, 0.9)  # shares of the height of an object between which a seat can be moved
-MOST = 0.3  # of an object's height, that its middle is stretched by
+MOST = 0.15  # of an object's height, that its seat moves by
 
 
 @record
@@ -75,20 +75,17 @@ def _higher(skin: Float[Tensor, "bodies points 3"], top: Float[Tensor, "region 3
 
 
 def with_lifted_seats(prepared: Prepared, lift: Float[Tensor, " objects"]) -> Prepared:
-    """The furniture with its seats higher by so much [m], beside earlier lifts (`stretch`).
-
-    A seat at the share t of the height moves by 2 t (1 - t) of the stretch of the middle.
-    """
+    """The furniture with its seats higher by so much [m], beside earlier lifts (`stretch`)."""
     straight = prepared.straight or prepared.objects
-    height = straight.size[:, 1].clamp_min(1e-9)
-    share = straight.top[..., 1].median(-1).values / height
-    rise = (lift / (2 * share * (1 - share)).clamp_min(1e-3)).clamp(-MOST * height, MOST * height)
-    rise = torch.where((share > BETWEEN[0]) & (share < BETWEEN[1]), rise, 0.0)
+    height, seat = straight.size[:, 1].clamp_min(1e-9), straight.top[..., 1].median(-1).values
+    low, high = (share * height for share in BETWEEN)
+    if prepared.stretch is not None:
+        lift = lift + prepared.stretch.rise
+    rise = lift.clamp(-MOST * height, MOST * height)
+    rise = torch.where((seat > low) & (seat < high), (seat + rise).clamp(low, high) - seat, 0.0)
     if not bool(rise.any()):
         return prepared
-    if prepared.stretch is not None:
-        rise = rise + prepared.stretch.rise
-    stretch = SeatStretch(torch.zeros_like(height), height, rise)
+    stretch = SeatStretch(torch.zeros_like(height), seat, height, rise)
     names = ("verts", "samples", "top", "back")
     lifted = {name: stretch.of(getattr(straight, name)) for name in names}
     objects = replace(prepared.objects, **lifted)
@@ -99,7 +96,7 @@ def seat_warnings(objects: tuple[SceneObject, ...]) -> tuple[str, ...]:
     """A sentence for each object whose seat is at another height than in its mesh."""
     return tuple(
         f"{piece.id}: its mesh does not fit the image and its seat is moved to where people sit, by"
-        f" up to {50 * float(abs(piece.stretch.rise * piece.scale[1])):.0f} cm"
+        f" {100 * float(abs(piece.stretch.rise * piece.scale[1])):.0f} cm"
         " (`mover run --no-seat-heights` leaves it)"
         for piece in objects
         if piece.stretch is not None
