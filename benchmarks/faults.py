@@ -265,7 +265,7 @@ def main() -> None:
     parser.add_argument("captures", nargs="*", type=Path)
     parser.add_argument("--rooms", nargs="*", default=[], help="SET:SEED of mover_bench")
     parser.add_argument("--i3db", type=Path, help="the folder i3DB of amonszpart/iMapper")
-    parser.add_argument("--unharmed", nargs="*", default=[], type=Path, help="false alarms alone")
+    parser.add_argument("--unharmed", nargs="*", default=[], help="rooms: false alarms alone")
     args = parser.parse_args()
     torch.set_num_threads(1)
     rooms: dict[str, Callable[[], Capture]] = {
@@ -276,11 +276,13 @@ def main() -> None:
             starts = starts_of(read_i3db(folder), Run(Path(kept)))
         for start, kind in zip(starts, ("library", "true shapes"), strict=True):
             rooms[f"{folder.name}, {kind}"] = partial(replace, start)
-    rooms |= {name: lambda name=name: room_named(name).capture for name in args.rooms}
+    known = {
+        name: lambda name=name: room_named(name).capture for name in args.rooms + args.unharmed
+    }
+    rooms |= {name: known[name] for name in args.rooms}
     found: dict[str, list[bool]] = {name: [] for name in FAULTS}
     alarms: list[str] = []
-    unharmed = {str(path): partial(read_capture, path) for path in args.unharmed}
-    for name, room in (rooms | unharmed).items():
+    for name, room in (known | rooms).items():
         capture = room()
         alarms += [f"{name}: {text}" for text in check_against_picture(capture).warnings]
         for fault, (words, change) in FAULTS.items() if name in rooms else ():
