@@ -87,7 +87,7 @@ def test_wrong_places_are_the_same_each_time_and_off(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("change", "words"), [
     ({}, "--source: expected the folder i3DB"),
     ({"source": "."}, "has no scene of i3DB"),
-    ({"source": ".", "variants": ("none",)}, "--variants: 'none' is no preset"),
+    ({"source": ".", "variants": ("none",)}, "--variants: 'none' is none of"),
 ])  # fmt: skip
 def test_what_is_no_i3db_is_a_sentence(change, words, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
@@ -99,10 +99,8 @@ def test_what_is_no_i3db_is_a_sentence(change, words, tmp_path, monkeypatch) -> 
 
 
 def test_a_table_has_a_row_a_scene_and_the_means() -> None:
-    keys = ("first", "run", "given", "run_given", "imapper", "run_pitch", "run_height", "stature")
-    lines = real.i3db_table(
-        {"a": dict.fromkeys(keys, 0.2), "b": dict.fromkeys(keys, 0.4)}
-    ).splitlines()
+    rows = {"a": dict.fromkeys(real.I3DB_COLUMNS, 0.2), "b": dict.fromkeys(real.I3DB_COLUMNS, 0.4)}
+    lines = real.i3db_table(rows).splitlines()
     assert len(lines) == 5
     assert lines[-1].startswith("| mean | 0.300 |")
 

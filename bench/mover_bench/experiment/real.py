@@ -48,11 +48,11 @@ from mover.perceive.capture import read_picture_of
 from mover.perceive.config import LayoutConfig
 from mover.perceive.layout import Picture, first_scene
 from mover.perceive.standing import seen_from
-from mover.pipeline.presets import PRESETS
 from mover.pipeline.reconstruct import reconstruct
 from mover_bench.cli import ExperimentArgs
 from mover_bench.datasets.i3db import I3dbScene, read_i3db
 from mover_bench.experiment.tables import judge_each, markdown
+from mover_bench.experiment.variants import VARIANTS, Variant, at_most, names_in, withheld
 
 log = logging.getLogger(__name__)
 VIEW = 65.0  # [degrees], horizontal, of a clip whose lens was not measured
@@ -199,18 +199,16 @@ SAME_KIND = {"stool": "chair"}
 
 
 def judge_i3db(args: ExperimentArgs, observe: Observer = silent) -> Path:
-    """Measure the scenes below `args.source` with the preset that `args.variants` names first.
+    """Measure the scenes below `args.source` with the first of `args.variants`.
 
     The summary is OUT/i3db/summary.md; the numbers are the .json beside it.
 
     Raises:
-        InputError: If there is no source, no scene in it, or no such preset.
+        InputError: If there is no source, no scene in it, or no such variant.
     """
     if args.source is None or not args.source.is_dir():
         raise InputError("--source: expected the folder i3DB of amonszpart/iMapper for --set i3db")
-    preset = args.variants[0]
-    if preset not in PRESETS:
-        raise InputError(f"--variants: {preset!r} is no preset; there are {', '.join(PRESETS)}")
+    variant = at_most(VARIANTS[names_in(args.variants)[0]], args.steps)
     folders = sorted(path for path in args.source.iterdir() if (path / "gt").is_dir())
     if not folders:
         raise InputError(f"{args.source}: has no scene of i3DB, expected folders like Scene04/gt")
@@ -218,14 +216,15 @@ def judge_i3db(args: ExperimentArgs, observe: Observer = silent) -> Path:
     out = args.out / "i3db"
 
     def judge(folder: Path) -> dict[str, Any]:
-        return judge_scene(read_i3db(folder), Run(out / folder.name), preset)
+        return judge_scene(read_i3db(folder), Run(out / folder.name), variant)
 
     return judge_each(folders, judge, i3db_table, out, observe)
 
 
 I3DB_COLUMNS = {
-    "first": "first scene", "run": "run from it", "given": "true shapes, wrongly placed",
-    "run_given": "run from them", "imapper": "iMapper's own result", "run_pitch": "pitch [degrees]",
+    "first": "first scene", "run_image": "by the image", "run": "result",
+    "given": "true shapes, wrongly placed", "run_given_image": "by the image",
+    "run_given": "result", "imapper": "iMapper's own result", "run_pitch": "pitch [degrees]",
     "run_height": "camera height [share]", "stature": "stature [m]",
 }  # fmt: skip
 """What the summary shows: IoU3D, errors of the camera of `run`, the fitted stature."""
@@ -234,14 +233,14 @@ I3DB_COLUMNS = {
 def i3db_table(found: dict[str, dict[str, Any]]) -> str:
     """The numbers as a table, with the mean of each overlap over the scenes."""
     lines = [[name, *(f"{row[key]:.3f}" for key in I3DB_COLUMNS)] for name, row in found.items()]
-    overlaps = list(I3DB_COLUMNS)[:5]
+    overlaps = list(I3DB_COLUMNS)[:7]
     means = [f"{sum(row[key] for row in found.values()) / len(found):.3f}" for key in overlaps]
     return (
         markdown(["scene", *I3DB_COLUMNS.values()], [*lines, ["mean", *means, "", "", ""]]) + "\n"
     )
 
 
-def judge_scene(scene: I3dbScene, run: Run, preset: str) -> dict[str, Any]:
+def judge_scene(scene: I3dbScene, run: Run, variant: Variant) -> dict[str, Any]:
     """Reconstruct a scene from both starts, and compare with the truth."""
     starts = starts_of(scene, run)
     bodies = starts[0].bodies
@@ -253,11 +252,14 @@ def judge_scene(scene: I3dbScene, run: Run, preset: str) -> dict[str, Any]:
     }
     for start, name, result in zip(starts, ("first", "given"), ("run", "run_given"), strict=True):
         numbers |= overlaps(name, start.scene.objects, scene)
+        nothing = Scene(start.scene.camera, math.nan, ())
         try:
-            found = reconstruct(start, PRESETS[preset], run).scene
+            room = reconstruct(withheld(start, variant.given, variant.cut), variant.config, run)
+            found, image = room.scene, room.image_only
         except InputError as error:  # such as a floor above the camera
             log.warning("%s, %s: %s; it counts 0", scene.name, result, error)
-            found = Scene(start.scene.camera, math.nan, ())
+            found = image = nothing
+        numbers |= overlaps(f"{result}_image", image.objects, scene)
         numbers |= overlaps(result, found.objects, scene)
         numbers |= camera_errors(result, found, scene.truth)
     return numbers
