@@ -22,7 +22,7 @@ LINES = {
     "src/mover/app": 4_370,
     "src/mover/bodies": 1_947,
     "src/mover/core": 1_566,
-    "src/mover/energy": 3_853,
+    "src/mover/energy": 3_861,
     "src/mover/evaluate": 986,
     "src/mover/extensions": 1_223,
     "src/mover/fitting": 1_977,

@@ -357,16 +357,24 @@ def apart_term(layout: Layout, objects: Objects, solids: Solids) -> Float[Tensor
     points, pairs = place(objects.samples, layout), solids.pairs
     pairs = pairs[_meet(layout, objects, pairs).cpu()]
     total = torch.zeros_like(layout.yaw) + 0 * layout.t_world_object.sum(-1)  # of all positions
-    for other in pairs[:, 1].unique().tolist():  # each with a volume of its own
-        ones = pairs[pairs[:, 1] == other, 0].to(points.device)
-        scale = layout.log_scale[other]
-        away = points[ones] - layout.t_world_object[other]
-        own = away @ rot_y(layout.yaw[other]) / scale.exp()
-        inside = -outline(solids.sections[other], own) * scale[::2].mean().exp()
-        deep = (inside - OVERLAP).relu() * solids.upright[ones]
-        near = deep.clamp_max(FAR)
-        total = total.index_add(0, ones, SAMPLES * (near * (2 * deep - near)).mean(-1))
-    return total
+    pairs = pairs[pairs[:, 1].argsort(stable=True)]
+    ones, others = pairs.to(points.device).unbind(-1)
+    scale, turns = layout.log_scale[others], rot_y(layout.yaw[others])
+    away = points[ones] - layout.t_world_object[others, None]
+    own = away @ turns / scale.exp()[:, None]
+    half = objects.size[others, None] / 2
+    off = own.detach() - half * half.new_tensor([0.0, 1.0, 0.0])
+    counts = solids.upright[ones] & (off.abs() < half + OVERLAP).all(-1)  # others are outside
+    row, found = counts.nonzero()[:, 0], own[counts]
+    known, number = others[row].unique_consecutive(return_counts=True)
+    parts = zip(known.tolist(), found.split(number.tolist()), strict=True)
+    inside = [-outline(solids.sections[k], part) for k, part in parts]  # a volume for each
+    if not inside:
+        return total
+    deep = torch.cat(inside) * scale[:, ::2].mean(-1).exp()[row] - OVERLAP
+    near = deep.relu().clamp_max(FAR)
+    cost = near * (2 * deep - near) * (SAMPLES / counts.shape[1])
+    return total.index_add(0, ones[row], cost)
 
 
 def _meet(
