@@ -206,6 +206,15 @@ def test_a_file_that_is_missing_or_not_json_or_has_a_name_twice_is_named(folder,
         refused(folder, name, "no such file")
 
 
+@pytest.mark.parametrize(("name", "given"), [
+    ("scene.json", "objects.json"), ("objects.json", "scene.json"), ("objects.json", "people.json"),
+    ("camera.json", "scene.json"),
+])  # fmt: skip
+def test_a_file_under_the_name_of_another_is_called_so(folder, name, given):
+    (folder / name).write_bytes((folder / given).read_bytes())
+    refused(folder, name, f"is it {given}")
+
+
 @pytest.mark.parametrize("name", ["bodies.npz", "contacts.npz"])
 def test_a_file_that_is_not_npz_is_named(folder, name):
     for content in (b"", b"PK\x03\x04 not really", (folder / name).read_bytes()[:200]):

@@ -65,6 +65,8 @@ MASKS: dict[str, tuple[Any, str]] = {  # what a file or the only file of a folde
                     "Label Studio's JSON, expected its export as COCO"),
     "mini.json": ([{"image": "a.jpg", "id": 1, "tag": [], "annotation_id": 3}],
                   "Label Studio's JSON"),
+    "min.json": ([{"image": "a", "id": 1, "label": [{"points": []}], "annotator": 1}],
+                 "Label Studio's JSON"),
     "guess.json": ([{"data": {"image": "a"}, "predictions": []}], "Label Studio's JSON"),
     "v7.json": ({"videos": [], "annotations": []}, "expected COCO's 'images' and 'annotations'"),
     "via.json": ({"a.jpg1": {"filename": "a.jpg", "regions": []}}, "project of VIA"),

@@ -295,10 +295,16 @@ def test_the_command_writes_what_is_asked_for(tmp_path, capsys):
     assert "on bones" in capsys.readouterr().out
 
 
-def test_without_usd_core_the_way_to_get_it_is_said(tmp_path, monkeypatch):
+def test_without_usd_core_the_way_to_get_it_is_said_and_the_rest_is_written(
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.setattr(mover.io.export.usd, "find_spec", lambda _: None)
     with pytest.raises(InputError, match=r"\.\[usd\]"):
         export_usd(finished(tmp_path), tmp_path)
+    out = write_out(tmp_path / "out", furnished(("chair",)))
+    assert run_command("export", [str(out), "--to", "usd", "ply"]) == 2
+    assert ".[usd]" in capsys.readouterr().err
+    assert list(out.rglob("chair_0.ply"))
 
 
 def test_a_second_export_gives_the_same_bytes(tmp_path):

@@ -502,6 +502,14 @@ def test_hostile_pickles_of_every_tool_are_refused_at_once_and_not_run(tool, tmp
     assert not (tmp_path / "owned").exists()
 
 
+def test_a_result_of_slahmr_given_to_another_tool_is_not_called_one_of_amass(tmp_path):
+    (path,) = made.write_slahmr(tmp_path).rglob("*.npz")
+    for tool in ("wham", "tram", "smplifyx"):
+        with pytest.raises(InputError, match=path.name) as error:
+            bodies_from(tool, path, KNOWN)
+        assert "AMASS" not in str(error.value)
+
+
 @pytest.mark.parametrize("write", [made.write_amass, made.write_amass_x])
 def test_a_motion_of_amass_given_as_bodies_is_named(write, tmp_path):
     """Also with arrays of objects, as of MoSh's stageii, and to another tool."""

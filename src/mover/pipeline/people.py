@@ -185,7 +185,7 @@ def check_floor(ground: float, capture: Capture) -> tuple[str, ...]:
         tilt = "R_cam_world upright" if capture.tilt is None else "the tilt (--tilt) the camera's"
         raise InputError(
             f"{cause} put the floor {abs(ground):.3g} m {side} the camera, expected {-HIGHEST:g} to"
-            f" {-LOWEST:g} m below; are places in metres, z forward, and {tilt}?"
+            f" {-LOWEST:g} m below; are places in metres, y down, z forward, and {tilt}?"
         )
     given = capture.scene.ground
     if given is None or abs(given - ground) <= APART:

@@ -132,8 +132,13 @@ def export(arguments: Sequence[str]) -> None:
     finished, folder = read_finished(args.out, args.capture), args.out / "export"
     options = {"glb": {"body": args.body}, "amass": {"up": args.up}, "contacts": {"up": args.up}}
     options |= {"usd": {"body": args.body, "up": args.up}}
+    failed: list[str] = []
     for target, write in writers.items():
-        found: Exported = write(finished, folder, **options.get(target, {}))
+        try:
+            found: Exported = write(finished, folder, **options.get(target, {}))
+        except InputError as error:  # such as a package that is missing: the others are written
+            failed.append(str(error))
+            continue
         shown = found.files if len(found.files) <= 3 else found.files[:1]
         more = f" and {len(found.files) - 1} more" if len(found.files) > 3 else ""
         say(f"{target}: {', '.join(str(file) for file in shown)}{more}")
@@ -141,6 +146,8 @@ def export(arguments: Sequence[str]) -> None:
             say(f"  {note}")
     if finished.bodies is not None and finished.bodies.fps is None:
         say(f"note: bodies.npz has no frame rate ('fps'): {FPS:g} frames a second are assumed")
+    if failed:
+        raise InputError("; ".join(failed))
 
 
 @dataclass(frozen=True)

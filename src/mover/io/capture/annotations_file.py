@@ -65,6 +65,9 @@ def _only_image(at: At) -> At:
     if at.maybe("images") is None and at.maybe("objects") is not None:
         at.refuse("COCO's annotations", "a scene (is it scene.json?)")
     images = at.get("images").items()
+    rows = at.maybe("annotations")
+    if len(images) > 1 and rows and any("track_id" in row.mapping() for row in rows.items()[:1]):
+        at.refuse("the annotations of one picture", "those of a video (is it people.json?)")
     if len(images) > 1:
         named = [shown(image.get("file_name").value) for image in images[:3]]
         how = (

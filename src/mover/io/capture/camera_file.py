@@ -49,6 +49,8 @@ def camera_of(at: At, other: Camera | None = None) -> Camera:
         at: The object.
         other: Its rotation is taken where `at` has none; without it the camera is level.
     """
+    if at.maybe("w") is None and at.maybe("objects") is not None:
+        at.refuse("a camera with 'w' and 'h'", "a scene (is it scene.json?)")
     lens = checked(at, CameraFields)
     if lens.w * lens.h > LARGEST_AREA:
         found = f"{lens.w} x {lens.h}"

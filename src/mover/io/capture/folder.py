@@ -150,7 +150,8 @@ def _bodies_of(
         bodies = into_camera(bodies, camera.R_cam_world @ rot_y(torch.tensor(turn)))
     rate = fps if bodies.fps is None else bodies.fps
     if rate is None and len(bodies.frame.unique()) > 1:
-        warn("bodies.npz: has no frame rate, so the people's speed is not used (give --fps)")
+        unused = "so the people's speed is not used (field 'fps', or --fps of `mover import`)"
+        warn(f"bodies.npz: has no frame rate, {unused}")
     elif rate is not None and not SLOW <= rate <= FAST:
         warn(f"bodies.npz: has {rate:g} frames a second; is that the rate of the video?")
     if rate is not None and fps is not None and abs(rate / fps - 1) > SAME_RATE:

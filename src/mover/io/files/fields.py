@@ -239,7 +239,8 @@ AMASS = (
 def is_amass(at: At) -> bool:
     """Whether these are the arrays of a motion."""
     keys = at.mapping().keys()
-    return "trans" in keys and "frame" not in keys and not keys.isdisjoint(("poses", "pose_body"))
+    other = not keys.isdisjoint(("frame", "cam_R"))  # bodies.npz, a result of SLAHMR
+    return "trans" in keys and not other and not keys.isdisjoint(("poses", "pose_body"))
 
 
 def read_npz(path: Path, most: int = LARGEST_FILE) -> At:

@@ -41,6 +41,7 @@ EXPORTS = {
     "Roboflow's predictions": "COCO segmentation",
 }
 """What is not read, and what to export in its place."""
+LABEL_STUDIO = {"completions", "annotation_id", "lead_time", "annotator"}  # keys of a task
 FOREIGN = {
     ".xml": "an XML of Pascal VOC", ".txt": "YOLO's text", ".zip": "an archive",
     ".csv": "a table",
@@ -185,7 +186,7 @@ def _of_json(at: At, names: Names, size: Size | None, picture: str | None) -> In
     keys = [set(row) if isinstance(row, dict) else set[str]() for row in rows]
     inner = at.value.values() if isinstance(at.value, dict) else ()
     foreign = {
-        "Label Studio's JSON": any(k & {"completions", "annotation_id", "lead_time"} for k in keys)
+        "Label Studio's JSON": any(k & LABEL_STUDIO for k in keys)
         or any("data" in k and k & {"annotations", "predictions"} for k in keys),
         "a project of VIA": any("_via_img_metadata" in one for one in keys)
         or any(isinstance(row, dict) and "regions" in row for row in inner),
