@@ -76,7 +76,10 @@ def test_it_is_said_that_bodies_without_masks_are_held_against_nothing(right):
     assert [any(said in line for line in lines) for lines in (whole, bare, alone)] == [0, 1, 0]
 
 
-@pytest.mark.parametrize("name", FAULTS)
+@pytest.mark.parametrize("name", [
+    pytest.param(name, marks=pytest.mark.slow) if number % 3 else name
+    for number, name in enumerate(FAULTS)
+])  # fmt: skip
 def test_a_fault_is_named_and_mended(right, name):
     words, change = FAULTS[name]
     harmed = change(right)
@@ -91,6 +94,7 @@ def test_a_fault_is_named_and_mended(right, name):
     assert float(mended.people.nanmean()) > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["the camera upside down", "positions with y down"])
 def test_a_mended_camera_takes_its_measured_tilt_along(right, name):
     harmed = FAULTS[name][1](right)
@@ -102,6 +106,7 @@ def test_a_mended_camera_takes_its_measured_tilt_along(right, name):
     assert torch.allclose(R, mended.scene.camera.R_cam_world, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_parts_of_different_pictures_and_nothing_to_compare_are_said(right):
     boxes = [torch.tensor([600.0 - 20 * k, 5, 610 - 20 * k, 10]) for k in range(3)]
     pairs = zip(right.detections, boxes, strict=True)
@@ -201,6 +206,7 @@ def test_unreadable_keypoints_are_said_and_stop_nothing(right, tmp_path):
     assert said.endswith("bodies are not held against it")
 
 
+@pytest.mark.slow
 def test_a_mended_capture_is_written_beside_the_given_one(right, tmp_path):
     harmed = FAULTS["bodies 5 frames late"][1](right)
     write_capture(harmed, tmp_path / "in")

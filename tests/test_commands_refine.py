@@ -66,6 +66,7 @@ def lowest(bodies: Bodies) -> torch.Tensor:
     return bodies.verts[..., 1].amin(1) - GROUND
 
 
+@pytest.mark.slow
 def test_refine_lifts_people_out_of_the_floor_and_says_how_wrong_they_were(tmp_path, capsys):
     out = finished(tmp_path / "out", standing(FAR))
     truth = finished(tmp_path / "truth", standing(0.0))

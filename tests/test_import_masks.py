@@ -126,6 +126,7 @@ def test_masks_of_another_size_are_stretched_and_of_another_shape_refused(tmp_pa
         read_instances(files["npz"], {}, None).fitted((128, 128))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not DATA.is_dir(), reason="the shared data is not here")
 def test_real_total3d_and_masks_of_its_boxes_become_one_capture(tmp_path):
     rows = json.loads((DATA / "total3d_1" / "input" / "detections.json").read_text())
@@ -209,6 +210,7 @@ def test_a_new_tilt_keeps_box_centres_in_the_camera(plain, tmp_path):
     assert second.scene.camera.R_cam_world.tolist() == layouts.FLIP.tolist()
 
 
+@pytest.mark.slow
 def test_a_measured_tilt_and_height_stay_when_other_parts_come(plain, tmp_path):
     out = tmp_path / "out"
     capture_of("total3d", layouts.write_total3d(tmp_path / "in", plain), tmp_path)

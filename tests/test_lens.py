@@ -156,6 +156,7 @@ def test_a_lens_of_which_nothing_is_stated_is_kept(off: float):
     assert found.warnings == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("off", "word"), [(1.09, "shorter"), (0.93, "longer")])
 def test_a_stated_guess_that_lines_correct_is_a_sentence(off: float, word: str):
     found = lens_of(drawn(0.5, seed=1), off * FOCAL, 0.055)
@@ -266,6 +267,7 @@ def exact(camera: Camera, seed: int = 0) -> tuple[Segments, torch.Tensor]:
     ), R  # fmt: skip
 
 
+@pytest.mark.slow
 def test_lines_of_two_cameras_state_an_error_as_wide_as_they_differ():
     """Each camera fits its lines sharply, and halves of all of them now this one, now that one."""
     apart, (one, _) = 0.2, exact(camera_of(FOCAL))

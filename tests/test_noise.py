@@ -80,6 +80,7 @@ def test_a_wrong_camera_keeps_centres_in_the_camera_frame_and_projects_fronts(ti
         assert torch.allclose(given.scale, piece.scale, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_camera_errors_have_the_stated_size(tiny: KnownRoom) -> None:
     true, light = torch.stack(pitch_roll(tiny.truth.camera.R_cam_world)), _light(tiny)
     errors = []
@@ -105,6 +106,7 @@ def _light(tiny: KnownRoom) -> KnownRoom:
     return dataclasses.replace(tiny, bodies=bodies, capture=capture)
 
 
+@pytest.mark.slow
 def test_object_errors_have_the_stated_ranges_and_lie_along_the_ray(tiny: KnownRoom) -> None:
     light, along, turn = _light(tiny), [], []
     for seed in range(60):
@@ -123,6 +125,7 @@ def test_object_errors_have_the_stated_ranges_and_lie_along_the_ray(tiny: KnownR
     assert abs(turn.std() - 30 / math.sqrt(3)) < 2
 
 
+@pytest.mark.slow
 def test_sizes_and_flips_follow_their_configuration(tiny: KnownRoom) -> None:
     light, factors, quarters = _light(tiny), [], []
     for seed in range(60):
@@ -275,6 +278,7 @@ def test_a_foreign_mesh_fills_the_box_and_is_another_shape(name, maker, monkeypa
     assert 0.005 < float(away) < 0.3
 
 
+@pytest.mark.slow
 def test_every_piece_has_foreign_meshes_and_most_are_open_or_unclean() -> None:
     meshes = [
         foreign_mesh(make_piece(name, np.random.default_rng(k)), 0.03, np.random.default_rng(k))

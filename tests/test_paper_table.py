@@ -78,6 +78,7 @@ def copy(stood: layouts.Room, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_a_perfect_result_scores_one_and_zero_in_every_column(copy, stood):
     """The truth is boxes and a scan; the result is the furniture itself where it stands.
 
@@ -252,6 +253,7 @@ def test_fewer_steps_are_other_jobs_of_the_same_command_line(tmp_path: Path) -> 
     assert key_of(people) != key_of(replace(people, vposer=""))
 
 
+@pytest.mark.slow
 def test_feet_are_the_soles_that_posa_names_and_contacts_are_those_of_the_bodies(copy):
     capture = read_capture(copy)
     bodies = capture.bodies

@@ -112,6 +112,7 @@ def pieces() -> list[SceneObject]:
     return furniture(ROOM)
 
 
+@pytest.mark.slow
 def test_furniture_along_walls_faces_the_room(tmp_path: Path):
     """A block has the same outline from behind, and nobody puts a cabinet back to front."""
     block = choose_piece("box", (0.9, 0.9, 0.45))
@@ -165,6 +166,7 @@ def test_usual_sizes_constrain_the_height_of_the_camera(pieces: list[SceneObject
     assert torch.equal(known.R_cam_world, camera().R_cam_world)
 
 
+@pytest.mark.slow
 def test_a_thing_of_which_many_shapes_are_known_says_no_more_than_another(pieces):
     once = screen_inputs(pieces, 1.2)
     odd = torch.tensor([1.3, 1, 1, 1])[:, None, None]  # one is not of the usual size

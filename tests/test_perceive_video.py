@@ -120,6 +120,7 @@ def test_jumps_ask_for_more_frames_a_second_and_walks_do_not(fps: float, dense: 
         assert not restless(gone)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("spread", "taken"), [(0.055, True), (0.0, False), (None, False)])
 def test_the_lens_of_the_lines_counts_before_bodies_are_fitted(spread: float | None, taken: bool):
     (picture, _), said = picture_of(0.5, seed=1), list[str]()

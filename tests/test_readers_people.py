@@ -725,6 +725,7 @@ def test_the_command_writes_bodies(tmp_path, capsys):
     assert (bodies.space, bodies.fps) == ("camera", 30.0)
 
 
+@pytest.mark.slow
 def test_an_import_takes_the_bodies_of_a_tool_by_their_path(tmp_path):
     """`--bodies PATH --bodies-from TOOL`: the same bodies as `mover bodies`, in the capture."""
     path = made.write_gvhmr(tmp_path)

@@ -332,6 +332,7 @@ def test_a_sitter_sunk_in_the_seat_comes_out_of_it():
     assert seat_gap(refine_bodies(room, None, QUICK).bodies, height).abs().max() < 0.02
 
 
+@pytest.mark.slow
 def test_bare_meshes_move_rigidly():
     bodies = replace(still_people(ARMS_DOWN, 2, lift=-0.05), pose=None)
     found = refine_bodies(room_with(bodies), None, replace(QUICK, rounds=2)).bodies
@@ -368,6 +369,7 @@ def test_real_people_of_sam_3d_body_stand_on_the_floor_of_their_feet(tmp_path):
     torch.testing.assert_close(kept, shape, atol=1e-4, rtol=0)
 
 
+@pytest.mark.slow
 def test_people_who_touch_nothing_stay_where_they_are():
     bodies = still_people(ARMS_DOWN, 3, lift=0.4, at=(1.0, -4.0))
     room = room_with(bodies, ((0.5, 0.5, 0.5), (-1.0, GROUND, -3.0)))
@@ -376,6 +378,7 @@ def test_people_who_touch_nothing_stay_where_they_are():
     torch.testing.assert_close(found.verts, bodies.verts, atol=1e-3, rtol=0)
 
 
+@pytest.mark.slow
 def test_chunks_do_not_show():
     bodies = still_people(ARMS_DOWN, 8, lift=-0.03)
     config = replace(QUICK, rounds=1, places=0, method=Adam(10))

@@ -1,6 +1,7 @@
 import functools
 from dataclasses import replace
 
+import pytest
 import torch
 from analytic import GROUND, boxes_of, image_at, make_inputs
 
@@ -71,6 +72,7 @@ def test_without_any_object_on_the_floor_nothing_changes():
     assert errors(found.camera, inputs.camera) == [0.0, 0.0]
 
 
+@pytest.mark.slow
 def test_standard_heights_level_a_camera_under_which_all_else_fits():
     """Tables as they look in the image, under a camera that is 1.5 degrees off: sizes fit it."""
     truth, floor = make_inputs(size=32).camera, torch.tensor(GROUND)

@@ -214,6 +214,7 @@ def test_masks_are_what_an_independent_ray_caster_sees(tiny: KnownRoom) -> None:
     assert counts.max() == 1, "no pixel belongs to two objects"
 
 
+@pytest.mark.slow
 def test_visible_people_and_furniture_share_the_image(tiny: KnownRoom) -> None:
     people, bodies = tiny.capture.people, tiny.bodies
     row, R = 20, tiny.truth.camera.R_cam_world

@@ -181,6 +181,7 @@ def tree(value):
     return [tree(v) for v in value] if isinstance(value, list | tuple) else value
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(plain, st.integers(2, 5))
 def test_plain_values_come_back_equal(tmp_path_factory, value, protocol):

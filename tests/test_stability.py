@@ -47,6 +47,7 @@ def alone(mesh: Mesh, lift: float = 0.0, **changes: Any) -> Scene:
     return Scene(camera(), GROUND, (dataclasses.replace(given, **changes),))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["coacd", "slices"])
 @pytest.mark.parametrize("name", ["chair", "sofa", "table"])
 def test_convex_pieces_fill_the_furniture_and_little_more(name: str, method: str):
@@ -116,6 +117,7 @@ def test_every_class_of_the_library_has_a_density():
     assert {canonical(name) for name in PIECES} <= set(solids.DENSITY)
 
 
+@pytest.mark.slow
 @needs_mujoco
 def test_mujoco_reads_the_model_with_everything_in_place(tmp_path: Path):
     scene = furnished((*BOXES, "shelf"))
@@ -228,6 +230,7 @@ def test_what_floats_is_sunk_or_leans_moves_and_what_hangs_is_held(
     assert found.stays == found.fixed == (support == "free")
 
 
+@pytest.mark.slow
 @needs_mujoco
 def test_what_stands_on_the_floor_or_on_a_table_stays_with_and_without_a_known_floor(tmp_path):
     table = piece("table_0", box(1.2, 0.7, 0.8), (0, -3), 0.2, GROUND)

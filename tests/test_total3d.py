@@ -92,6 +92,7 @@ def test_a_broken_or_missing_file_is_named(tmp_path, file, content, words):
     assert content is None or "expected" in str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not DATA.is_dir(), reason="the shared data is not here")
 def test_real_output_is_as_loose_and_tilted_as_known_and_survives_as_a_capture(tmp_path):
     found = read("total3d", DATA)

@@ -70,6 +70,7 @@ def test_the_official_matrix_gives_smplx_the_vertices_of_smpl(
     assert np.mean(miss) < 0.01
 
 
+@pytest.mark.slow
 def test_a_fit_of_smplx_starts_from_smpl_by_the_matrix_or_by_its_angles(
     matrix_file, moved, monkeypatch
 ):

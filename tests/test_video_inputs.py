@@ -66,6 +66,7 @@ def rows(capture: Path, name: str) -> list[dict[str, Any]]:
     return json.loads((capture / name).read_text())["annotations"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turns", [1, 2, 3])
 @pytest.mark.parametrize("tall", [False, True])
 def test_a_phone_that_was_turned_gives_what_an_upright_one_gives(tmp_path, turns, tall):
@@ -112,6 +113,7 @@ def test_of_a_slow_video_or_at_its_own_rate_all_frames_are_taken_at_their_times(
     assert clip.time.tolist() == pytest.approx([t / SECOND for t in times], abs=1e-3)
 
 
+@pytest.mark.slow
 def test_another_video_in_the_same_folder_leaves_nothing_of_the_first(tmp_path: Path):
     perceived(filmed(tmp_path / "v.mp4", Shot(), range(0, 2 * SECOND, 3)), tmp_path / "c")
     assert (tmp_path / "c" / "keypoints.npz").is_file()
@@ -125,6 +127,7 @@ def absent(_clip: Clip, _config: PerceiveConfig, _: Observer = silent) -> Finds:
     raise InputError("no network")
 
 
+@pytest.mark.slow
 def test_what_replaced_a_file_stays_until_a_new_flag_gives_it(tmp_path: Path, capsys):
     """What was removed is made again; of another video that is said."""
     for name, shot in (("v", Shot()), ("w", Shot(1))):
@@ -299,6 +302,7 @@ def test_outlines_beyond_the_picture_or_of_a_frame_beyond_the_video_are_said(
     assert re.search(words, "\n".join(said))
 
 
+@pytest.mark.slow
 def test_without_a_network_for_furniture_all_else_is_written_and_the_outlines_are_asked_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -99,6 +99,7 @@ def assert_same(verts: Tensor, faces: Tensor, grid: Volume) -> Tensor:
     return found
 
 
+@pytest.mark.slow
 def test_posed_bodies_have_the_distances_and_signs_of_libigl():
     verts, faces = posed_bodies(4)
     assert is_closed(faces)

@@ -174,6 +174,7 @@ def test_a_single_flat_sheet_keeps_its_outline():
     assert high[1] - low[1] < 2 / 96
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("level", "share"), [(4, 0.03), (6, 0.02)], ids=["small", "large"])
 def test_a_solid_with_missing_faces_is_filled_again(level: int, share: float):
     shape = sphere(level, 0.5)

@@ -26,7 +26,7 @@ def poses_at(path: CameraPath, frame: Int[Tensor, " rows"]) -> CameraPath:
     R, t = path.R_reference_camera, path.t_reference_camera
     if is_still(path):
         return CameraPath(frame, R.expand(len(frame), 3, 3), t.expand(len(frame), 3))
-    after = torch.searchsorted(path.frame, frame).clamp(1, len(path.frame) - 1)
+    after = torch.searchsorted(path.frame, frame.contiguous()).clamp(1, len(path.frame) - 1)
     first, last = path.frame[after - 1], path.frame[after]
     share = ((frame - first) / (last - first)).clamp(0, 1)[:, None].to(t)
     turn = rotation_vectors(R[after - 1].mT @ R[after])
