@@ -133,6 +133,15 @@ def people_inverted(capture: Capture) -> Capture | None:
     return seen and replace(capture, people=replace(seen, masks=other(seen.masks)))
 
 
+def boxes_as_corners(capture: Capture) -> Capture:
+    """Right and lower ends read as widths and heights."""
+
+    def read(one: Detection) -> Detection:
+        return replace(one, box=torch.cat([one.box[:2], one.box[:2] + one.box[2:]]))
+
+    return replace(capture, detections=tuple(map(read, capture.detections)))
+
+
 def furniture_inverted(some: slice) -> Change:
     """Masks of some of the furniture, and their boxes."""
 
@@ -218,6 +227,7 @@ FAULTS: dict[str, tuple[str, Change]] = {
     "annotations exchanged": ("exchanged", exchanged),
     "masks of people inverted": ("inverted", people_inverted),
     "masks of furniture inverted": ("inverted", furniture_inverted(slice(None))),
+    "boxes as corners": ("[x1, y1, x2, y2]", boxes_as_corners),
     "one mask of furniture inverted": ("is inverted", furniture_inverted(slice(1))),
     "one person 5 frames late": ("5 frames late", one_late),
     "one object 5 times too large": ("times too large", mesh(

@@ -235,6 +235,8 @@ def hypotheses(capture: Capture, found: agree.Agreement) -> Iterator[Fault]:
         yield Fault(f"camera.json: the camera {what}", UP, mend)
     yield Fault("people.json: the masks are inverted", "invert them", mends.inverted_people)
     yield Fault("objects.json: the masks are inverted", "invert them", mends.inverted_objects)
+    corners = "objects.json: the boxes are [x1, y1, x2, y2]"
+    yield Fault(corners, "COCO's are [x, y, w, h]", mends.boxes_of_corners)
     for name, axes in PEOPLE.items():
         cure = "the camera's axes are x right, y down, z forward"
         mend = partial(mends.people, mends.axes(axes))

@@ -140,6 +140,16 @@ def inverted_objects(capture: Capture, only: int | None = None) -> Capture:
     return replace(capture, detections=tuple(map(other, capture.detections)))
 
 
+def boxes_of_corners(capture: Capture) -> Capture:
+    """Boxes whose widths and heights are their right and lower ends."""
+
+    def other(one: Detection) -> Detection:
+        box = torch.cat([one.box[:2], one.box[2:] - one.box[:2]])
+        return replace(one, box=box) if bool((box[2:] > box[:2]).all()) else one
+
+    return replace(capture, detections=tuple(map(other, capture.detections)))
+
+
 def _inverted(masks: Masks) -> Masks:
     from pycocotools import mask as coco
 
