@@ -16,6 +16,7 @@ from mover.core.types import Masks
 from mover.geometry.rle import decode
 from mover.io.masks.instance_files import read_people, read_things
 from mover.io.masks.instances import Instances
+from mover.io.people.found import followed
 
 H, W = 48, 64
 KEPT = (0, 1, 2, 6, 7)
@@ -202,6 +203,14 @@ def test_people_without_tracks_are_followed_by_place_not_by_score(boxes, tmp_pat
     for k in range(12):
         assert (got[k, 0] == walker(0, 2)).all()
         assert (got[k, 1] == walker(k, 24)).all()
+
+
+def test_people_who_cross_keep_their_tracks():
+    """One comes from the left, one from the right, who is hidden for two frames."""
+    rows = [(f, x) for f in range(20) for x in (94 + 40 * f, 884 - 38 * f)[: 1 + (f not in (7, 8))]]
+    places = np.array([(x, 300.0) for _, x in rows])
+    tracks = followed([f for f, _ in rows], places, np.full(len(rows), 300.0))
+    assert tracks.tolist() == [int(x != 94 + 40 * f) for f, x in rows]
 
 
 def test_a_stack_of_frames_is_a_person_and_one_of_apart_masks_are_people(tmp_path):

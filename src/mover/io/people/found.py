@@ -21,6 +21,7 @@ UNTRACKED = -1
 PATIENCE = 15  # a person who is gone for so many frames starts a new track
 REACH = 0.6  # of a person's size: how far one may move from frame to frame
 GROWTH = 0.25  # `REACH` grows by this share with each frame of a gap
+AHEAD = 0.5  # of the way at its last speed, where a track leads: people stop and turn
 
 
 @dataclass(frozen=True)
@@ -94,23 +95,26 @@ def followed(
 ) -> NDArray[np.int64]:
     """Tracks of people that each frame lists in any order.
 
-    The nearest pair of a track and a person is joined first, if the person moved no further than
-    `REACH` of the larger of the two sizes, and a little more after a gap. Positions (rows, axes)
-    and sizes (rows,) have one unit, any.
+    The pair of a track and a person that is nearest to where the track leads (`AHEAD`) is joined
+    first, if the person moved no further than `REACH` of the larger of the two sizes, and a little
+    more after a gap. Positions (rows, axes) and sizes (rows,) have one unit, any.
     """
     tracks, order = np.full(len(frames), -1, dtype=np.int64), np.asarray(frames)
-    last: dict[int, int] = {}
+    last, speed = dict[int, int](), dict[int, NDArray[np.float64]]()
     for frame in sorted(set(frames)):
         current: list[int] = np.flatnonzero(order == frame).tolist()
         recent = [(t, before) for t, before in last.items() if frame - frames[before] <= PATIENCE]
         options: list[tuple[float, int, int]] = []
         for (track, before), row in product(recent, current):
             gap, size = frame - frames[before], max(sizes[row], sizes[before], 1e-9)
-            way = float(np.linalg.norm(positions[row] - positions[before]) / size)
-            if way <= REACH * (1 + GROWTH * (gap - 1)):
-                options.append((way, track, row))
+            way = positions[row] - positions[before]
+            if np.linalg.norm(way) <= size * REACH * (1 + GROWTH * (gap - 1)):
+                off = way - AHEAD * gap * speed.get(track, 0.0)
+                options.append((float(np.linalg.norm(off) / size), track, row))
         for _, track, row in sorted(options):
             if tracks[row] < 0 and last[track] not in current:
+                before = last[track]
+                speed[track] = (positions[row] - positions[before]) / (frame - frames[before])
                 tracks[row], last[track] = track, row
         for row in current:
             if tracks[row] < 0:
