@@ -124,6 +124,22 @@ def test_the_video_is_behind_the_furniture(tmp_path: Path):
     assert (pictures[2][0, 0] - pictures[0][0, 0]).abs().max() > 0.2
 
 
+def test_a_film_is_what_each_picture_would_be_alone(monkeypatch):
+    """Only where people are is drawn again; what they leave and what they hide is right."""
+    scene, bodies, frames = room(), walkers(12), [0, 4, 11]
+    found = list(render_room(scene, bodies, frames, 320))
+    everywhere = slice(None), slice(None)
+    monkeypatch.setattr(overlay, "window_of", lambda *_: everywhere)
+    for picture, whole in zip(found, render_room(scene, bodies, frames, 320), strict=True):
+        off = (picture - whole).abs().amax(-1)
+        assert float(off.mean()) < 1e-4
+        assert float((off > 0.02).float().mean()) < 1e-3  # pixels at edges
+    assert float((found[0] - found[2]).abs().amax()) > 0.2
+    away = dataclasses.replace(bodies, verts=bodies.verts + torch.tensor([0.0, 90.0, 0.0]))
+    empty = list(render_room(scene, away, frames, 320))
+    assert torch.equal(empty[0], empty[2])
+
+
 def test_frames_of_a_film_are_found_by_their_number(tmp_path: Path):
     pytest.importorskip("av")
     shades = [torch.full((32, 48, 3), k / 10) for k in range(10)]

@@ -167,9 +167,11 @@ def render(arguments: Sequence[str]) -> None:
     """`mover render`."""
     args = parsed(RenderArgs, "mover render", arguments)
     _check_result(args.out)
+    from mover.app.cli import Bar
     from mover.app.pictures.overlay import render_result
 
-    count = render_result(args.out, args.to, args.config, args.capture)
+    with Bar() as bar:
+        count = render_result(args.out, args.to, args.config, args.capture, bar)
     what = "one picture" if count == 1 else f"{count} pictures"
     say(f"{args.to}: {what}")
 

@@ -27,9 +27,10 @@ from mover.app.pictures.film import (
 from mover.bodies.corrected import in_world
 from mover.core.colours import colour, css, person_colour
 from mover.core.errors import InputError
+from mover.core.observe import Observer, Step, silent
 from mover.core.records import map_tensors, record, rows_of
 from mover.core.types import Bodies, Camera, Capture, Masks, Scene
-from mover.geometry.camera import to_camera
+from mover.geometry.camera import project, to_camera
 from mover.geometry.mesh import face_normals, vertex_normals
 from mover.geometry.placement import place_object, placed_at
 from mover.geometry.raster import first_hit
@@ -49,6 +50,7 @@ THICK = 550  # [px] of width for each fine pixel of an outline's thickness
 OPACITY = 0.62  # of surfaces
 AMBIENT, LAMP, FILL = 0.62, 0.48, 0.12  # light of the room, the lamp and the camera
 METRE, FAINT = 0.5, 0.6  # opacity of the floor's lines, and their brightness
+NEAR = 0.05  # [m], in front of the camera: what is nearer may be anywhere in the picture
 EDGE = 1.2  # [m], how far the floor reaches beyond what stands on it
 
 
@@ -124,13 +126,30 @@ def draw_picture(
     owners of the pixels, `FINE` along each side of one.
     """
     camera = sized_camera(camera, base.shape[1], base.shape[0])
+    sheet, owner = draw_sheet(surfaces, camera, floor_lines(camera, ground, surfaces.verts))
+    return over(sheet, base).clamp(0, 1), owner
+
+
+def floor_lines(
+    camera: Camera, ground: float | None, verts: Float[Tensor, "verts 3"]
+) -> Float[Tensor, "h w 4"] | None:
+    """Lines of the floor below some points; None: its height is not known, or there are none."""
+    if ground is None or ground >= 0 or not len(verts):
+        return None
+    flat = verts[:, [0, 2]]
+    return metre_lines(camera, ground, flat.amin(0) - EDGE, flat.amax(0) + EDGE)
+
+
+def draw_sheet(
+    surfaces: Surfaces, camera: Camera, lines: Float[Tensor, "h w 4"] | None
+) -> tuple[Float[Tensor, "h w 4"], Int[Tensor, "fine_h fine_w"]]:
+    """Surfaces over lines of the floor, and the owners of the fine pixels."""
     drawn = draw(surfaces, sized_camera(camera, FINE * camera.width, FINE * camera.height))
-    if ground is not None and ground < 0 and len(surfaces.verts):
+    sheet = paint(drawn)
+    if lines is not None:
         free = avg_pool2d((drawn.owner == NO_OWNER).float()[None], FINE)[0, ..., None]
-        flat = surfaces.verts[:, [0, 2]]
-        lines = metre_lines(camera, ground, flat.amin(0) - EDGE, flat.amax(0) + EDGE)
-        base = over(FAINT * lines * free, base)
-    return over(paint(drawn), base).clamp(0, 1), drawn.owner
+        sheet = sheet + (1 - sheet[..., 3:]) * FAINT * lines * free
+    return sheet, drawn.owner
 
 
 def sized_camera(camera: Camera, width: int, height: int) -> Camera:
@@ -326,7 +345,13 @@ def _named(
 FPS = 5.0  # of images that have no time
 
 
-def render_result(out: Path, path: Path, config: RenderConfig, capture: Path | None = None) -> int:
+def render_result(
+    out: Path,
+    path: Path,
+    config: RenderConfig,
+    capture: Path | None = None,
+    observe: Observer = silent,
+) -> int:
     """Draw a result into a .png, .jpg, .jpeg or .mp4; the number of pictures.
 
     The video of the capture, or its reference image, is behind the furniture.
@@ -353,7 +378,7 @@ def render_result(out: Path, path: Path, config: RenderConfig, capture: Path | N
         raise InputError("--to: nothing moves: ask for a .png")
     steps = torch.tensor(frames).diff().float()
     rate = (bodies.fps or FPS) / (max(1.0, float(steps.median())) if len(steps) else 1.0)
-    return save_film(render_room(scene, shown, frames, config.width, capture), rate, path)
+    return save_film(render_room(scene, shown, frames, config.width, capture, observe), rate, path)
 
 
 def render_room(
@@ -362,19 +387,60 @@ def render_room(
     frames: Sequence[int],
     width: int,
     capture: Path | None = None,
+    observe: Observer = silent,
 ) -> Iterator[Float[Tensor, "h w 3"]]:
     """A room and the people in its world, one picture a frame, even in width and height [px]."""
-    camera, width = scene.camera, width - width % 2
-    size = width, max(2, 2 * round(width * camera.height / camera.width / 2))
-    base = backdrop(size[1], size[0])
+    width -= width % 2
+    size = width, max(2, 2 * round(width * scene.camera.height / scene.camera.width / 2))
+    camera, base = sized_camera(scene.camera, *size), backdrop(size[1], size[0])
     found: Iterator[Float[Tensor, "h w 3"] | None] = iter([None] * len(frames))
     if capture is not None:
         image, found = read("folder", capture).reference, video_pictures(capture, frames, size)
         base = base if image is None else sized(Image.fromarray(pixels(image)), size)
-    for frame, picture in zip(frames, found, strict=True):
-        stands = tuple(placed_at(item, frame) for item in scene.objects)
-        surfaces = [furniture(dataclasses.replace(scene, objects=stands))]
-        if bodies is not None:
-            surfaces.append(people(bodies, (bodies.frame == frame).nonzero()[:, 0].tolist()))
-        behind = base if picture is None else picture
-        yield draw_picture(joined(surfaces), camera, behind, scene.ground)[0]
+    room, walked = furniture(scene), torch.zeros(0, 3)
+    if bodies is not None:
+        walked = bodies.verts.detach().float().flatten(0, 1)
+    lines = floor_lines(camera, scene.ground, torch.cat([room.verts, walked]))
+    still = draw_sheet(room, camera, lines)[0]
+    for number, (frame, picture) in enumerate(zip(frames, found, strict=True)):
+        observe(Step("render", number, len(frames)))
+        sheet, behind = still, base if picture is None else picture
+        rows = [] if bodies is None else (bodies.frame == frame).nonzero()[:, 0].tolist()
+        moved = any(item.segments for item in scene.objects)
+        if moved:
+            stands = tuple(placed_at(item, frame) for item in scene.objects)
+            room = furniture(dataclasses.replace(scene, objects=stands))
+            lines = floor_lines(camera, scene.ground, torch.cat([room.verts, walked]))
+        if moved or rows:
+            surfaces = joined([room] if bodies is None else [room, people(bodies, rows)])
+            part = slice(None), slice(None)
+            if not moved and bodies is not None:  # nothing but the people is new
+                part = window_of(bodies.verts[rows].flatten(0, 1), camera)
+            sheet = still.clone()
+            if sheet[part].numel():
+                own = None if lines is None else lines[part]
+                sheet[part] = draw_sheet(surfaces, cropped(camera, part), own)[0]
+        yield over(sheet, behind).clamp(0, 1)
+
+
+def window_of(verts: Float[Tensor, "verts 3"], camera: Camera) -> tuple[slice, slice]:
+    """Rows and columns of a picture in which points are seen, and their outlines."""
+    seen = to_camera(verts.float(), camera.R_cam_world)
+    if bool((seen[:, 2] < NEAR).any()):
+        return slice(0, camera.height), slice(0, camera.width)
+    at = project(seen, camera.K)
+    margin = 2 + camera.width // THICK
+    ends = torch.stack([at.amin(0).floor() - margin, at.amax(0).ceil() + margin]).long()
+    (left, right), (top, bottom) = (
+        ends[:, k].clamp(0, side).tolist() for k, side in enumerate((camera.width, camera.height))
+    )
+    return slice(top, bottom), slice(left, right)
+
+
+def cropped(camera: Camera, part: tuple[slice, slice]) -> Camera:
+    """The camera of a part of a picture."""
+    (top, bottom, _), (left, right, _) = (
+        one.indices(side) for one, side in zip(part, (camera.height, camera.width), strict=True)
+    )
+    K = camera.K - torch.tensor([[0.0, 0, left], [0, 0, top], [0, 0, 0]])
+    return Camera(K, camera.R_cam_world, right - left, bottom - top)
