@@ -269,30 +269,31 @@ FAULTS: dict[str, tuple[str, Change]] = {
 """What is done to a capture, and words of the warning that is right."""
 
 
+def capture_of(name: str) -> Capture:
+    """The capture in a folder, or of the room SET:SEED."""
+    return read_capture(Path(name)) if Path(name).is_dir() else room_named(name).capture
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("captures", nargs="*", type=Path)
+    parser.add_argument("captures", nargs="*")
     parser.add_argument("--rooms", nargs="*", default=[], help="SET:SEED of mover_bench")
     parser.add_argument("--i3db", type=Path, help="the folder i3DB of amonszpart/iMapper")
-    parser.add_argument("--unharmed", nargs="*", default=[], help="rooms: false alarms alone")
+    parser.add_argument("--unharmed", nargs="*", default=[], help="these: false alarms alone")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    rooms: dict[str, Callable[[], Capture]] = {
-        str(path): partial(read_capture, path) for path in args.captures
-    }
+    named = [*args.captures, *args.rooms]
+    rooms: dict[str, Callable[[], Capture]] = {name: partial(capture_of, name) for name in named}
     for folder in sorted(args.i3db.glob("Scene*")) if args.i3db else ():
         with TemporaryDirectory() as kept:
             starts = starts_of(read_i3db(folder), Run(Path(kept)))
         for start, kind in zip(starts, ("library", "true shapes"), strict=True):
             rooms[f"{folder.name}, {kind}"] = partial(replace, start)
-    known = {
-        name: lambda name=name: room_named(name).capture for name in args.rooms + args.unharmed
-    }
-    rooms |= {name: known[name] for name in args.rooms}
     found: dict[str, list[bool]] = {name: [] for name in FAULTS}
     alarms: list[str] = []
-    for name, room in (known | rooms).items():
+    unharmed = {name: partial(capture_of, name) for name in args.unharmed}
+    for name, room in (rooms | unharmed).items():
         capture = room()
         alarms += [f"{name}: {text}" for text in check_against_picture(capture).warnings]
         for fault, (words, change) in FAULTS.items() if name in rooms else ():

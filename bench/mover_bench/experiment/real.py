@@ -252,13 +252,12 @@ def judge_scene(scene: I3dbScene, run: Run, variant: Variant) -> dict[str, Any]:
     }
     for start, name, result in zip(starts, ("first", "given"), ("run", "run_given"), strict=True):
         numbers |= overlaps(name, start.scene.objects, scene)
-        nothing = Scene(start.scene.camera, math.nan, ())
         try:
             room = reconstruct(withheld(start, variant.given, variant.cut), variant.config, run)
             found, image = room.scene, room.image_only
         except InputError as error:  # such as a floor above the camera
             log.warning("%s, %s: %s; it counts 0", scene.name, result, error)
-            found = image = nothing
+            found = image = Scene(start.scene.camera, math.nan, ())
         numbers |= overlaps(f"{result}_image", image.objects, scene)
         numbers |= overlaps(result, found.objects, scene)
         numbers |= camera_errors(result, found, scene.truth)

@@ -397,30 +397,31 @@ def render_room(
     if capture is not None:
         image, found = read("folder", capture).reference, video_pictures(capture, frames, size)
         base = base if image is None else sized(Image.fromarray(pixels(image)), size)
-    room, walked = furniture(scene), torch.zeros(0, 3)
-    if bodies is not None:
-        walked = bodies.verts.detach().float().flatten(0, 1)
-    lines = floor_lines(camera, scene.ground, torch.cat([room.verts, walked]))
-    still = draw_sheet(room, camera, lines)[0]
+    walked = torch.zeros(0, 3)  # two corners of where people ever are
+    if bodies is not None and len(bodies.verts):
+        ends = bodies.verts.amin((0, 1)), bodies.verts.amax((0, 1))
+        walked = torch.stack(ends).detach().float()
+
+    def empty(frame: int) -> tuple[Surfaces, Tensor | None, Tensor]:
+        """The furniture where it stands, lines of the floor, and the sheet of both."""
+        stands = tuple(placed_at(item, frame) for item in scene.objects)
+        room = furniture(dataclasses.replace(scene, objects=stands))
+        lines = floor_lines(camera, scene.ground, torch.cat([room.verts, walked]))
+        return room, lines, draw_sheet(room, camera, lines)[0]
+
+    known, moved = None, any(item.segments for item in scene.objects)
     for number, (frame, picture) in enumerate(zip(frames, found, strict=True)):
         observe(Step("render", number, len(frames)))
-        sheet, behind = still, base if picture is None else picture
+        known = empty(frame) if known is None or moved else known
+        room, lines, sheet = known
         rows = [] if bodies is None else (bodies.frame == frame).nonzero()[:, 0].tolist()
-        moved = any(item.segments for item in scene.objects)
-        if moved:
-            stands = tuple(placed_at(item, frame) for item in scene.objects)
-            room = furniture(dataclasses.replace(scene, objects=stands))
-            lines = floor_lines(camera, scene.ground, torch.cat([room.verts, walked]))
-        if moved or rows:
-            surfaces = joined([room] if bodies is None else [room, people(bodies, rows)])
-            part = slice(None), slice(None)
-            if not moved and bodies is not None:  # nothing but the people is new
-                part = window_of(bodies.verts[rows].flatten(0, 1), camera)
-            sheet = still.clone()
+        if bodies is not None and rows:  # only where they are is anything new
+            part = window_of(bodies.verts[rows].flatten(0, 1), camera)
             if sheet[part].numel():
+                surfaces, sheet = joined([room, people(bodies, rows)]), sheet.clone()
                 own = None if lines is None else lines[part]
                 sheet[part] = draw_sheet(surfaces, cropped(camera, part), own)[0]
-        yield over(sheet, behind).clamp(0, 1)
+        yield over(sheet, base if picture is None else picture).clamp(0, 1)
 
 
 def window_of(verts: Float[Tensor, "verts 3"], camera: Camera) -> tuple[slice, slice]:
@@ -439,8 +440,6 @@ def window_of(verts: Float[Tensor, "verts 3"], camera: Camera) -> tuple[slice, s
 
 def cropped(camera: Camera, part: tuple[slice, slice]) -> Camera:
     """The camera of a part of a picture."""
-    (top, bottom, _), (left, right, _) = (
-        one.indices(side) for one, side in zip(part, (camera.height, camera.width), strict=True)
-    )
-    K = camera.K - torch.tensor([[0.0, 0, left], [0, 0, top], [0, 0, 0]])
-    return Camera(K, camera.R_cam_world, right - left, bottom - top)
+    down, right = part
+    K = camera.K - torch.tensor([[0.0, 0, right.start], [0, 0, down.start], [0, 0, 0]])
+    return Camera(K, camera.R_cam_world, right.stop - right.start, down.stop - down.start)

@@ -65,10 +65,10 @@ def _only_image(at: At) -> At:
     if at.maybe("images") is None and at.maybe("objects") is not None:
         at.refuse("COCO's annotations", "a scene (is it scene.json?)")
     images = at.get("images").items()
-    rows = at.maybe("annotations")
-    if len(images) > 1 and rows and any("track_id" in row.mapping() for row in rows.items()[:1]):
-        at.refuse("the annotations of one picture", "those of a video (is it people.json?)")
     if len(images) > 1:
+        rows = at.maybe("annotations")
+        if rows and any("track_id" in row.mapping() for row in rows.items()):
+            at.refuse("the annotations of one picture", "those of a video (is it people.json?)")
         named = [shown(image.get("file_name").value) for image in images[:3]]
         how = (
             "`mover import masks FILE --image PICTURE --out FOLDER` takes that of a picture's name"

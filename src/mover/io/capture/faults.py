@@ -182,11 +182,11 @@ def _unexplained(thin: Capture, found: agree.Agreement) -> Iterator[str]:
         missed = f"bodies.npz: the bodies miss their masks {both}".format
         yield f"{missed(mean(found.people))}; are bodies, masks and camera of one video?"
         return
-    person = torch.zeros(0) if thin.bodies is None else thin.bodies.person
-    for one in person.unique().tolist() if rows else ():
+    person = torch.zeros(0) if thin.bodies is None or not rows else thin.bodies.person
+    for one in person.unique().tolist():
         own = seen & (person == one)
         if not own.any() and thin.keypoints is not None:  # without a mask: said by the reader
-            yield f"bodies.npz: no masks show person {one}, whom the bodies have"
+            yield f"bodies.npz: no keypoints show person {one}, whom the bodies have"
         elif int(own.sum()) >= FEWEST and mean(found.people[own]) < POOR:
             missed = f"bodies.npz: the bodies of person {one} miss their masks {both}".format
             yield f"{missed(mean(found.people[own]))}; are they of this video?"
